@@ -1,0 +1,3 @@
+"""x."""
+from diffrast.raster import rasterize, Fragments
+from diffrast.interpolate import interpolate

@@ -1,0 +1,132 @@
+"""Checks of what a user passes: each error names the argument, what was wanted and what came.
+
+Shapes and dtypes are checked always, also while tracing. Values (finite numbers, indices in range)
+can only be checked where they are known: a traced array passes.
+"""
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+# What a public function may be given where it wants an array: also lists and tuples of numbers.
+ArrayInput: TypeAlias = ArrayLike | Sequence[Any]
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether the numbers of `value` are known now, not only their shape."""
+    return not isinstance(value, jax.core.Tracer)
+
+
+def float_array(
+    name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, finite: bool = True
+) -> Array:
+    """Convert to a floating-point array and check its shape.
+
+    Args:
+        name: the argument's name, for the error.
+        value: anything array-like. float64 stays float64 where JAX has it enabled; all other
+            types become JAX's default float.
+        shape: wanted shape. An int is an exact size, a str names an axis of any size; the
+            same str twice means equal sizes. A leading "..." stands for any number of
+            axes. `None` accepts every shape.
+        finite: refuse NaN and infinity, where the values are known.
+
+    Raises:
+        ValueError: for anything that is not an array of real numbers of that shape.
+    """
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(
+            f"{name}: wanted an array of numbers, got {_brief(value)} ({error})"
+        ) from error
+    if array.dtype == bool or jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise ValueError(f"{name}: wanted real numbers, got dtype {array.dtype}")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    elif array.dtype != jnp.float64:
+        array = array.astype(jnp.promote_types(array.dtype, jnp.float32))
+    _check_shape(name, array.shape, shape)
+    if finite and is_concrete(array):
+        bad = np.argwhere(~np.isfinite(np.asarray(array)))
+        if len(bad):
+            where = tuple(int(i) for i in bad[0])
+            raise ValueError(
+                f"{name}: wanted finite numbers, got {np.asarray(array)[where]} at index {where}"
+                f" ({len(bad)} such value{'s' if len(bad) > 1 else ''})"
+            )
+    return array
+
+
+def index_array(
+    name: str, value: Any, shape: tuple[int | str, ...], *, minimum: int = 0, bound: int
+) -> Array:
+    """Convert to int32 and check that every index lies in [minimum, bound)."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(
+            f"{name}: wanted an array of integers, got {_brief(value)} ({error})"
+        ) from error
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise ValueError(f"{name}: wanted integers, got dtype {array.dtype}")
+    _check_shape(name, array.shape, shape)
+    if is_concrete(array) and array.size:
+        numbers = np.asarray(array)
+        bad = np.argwhere((numbers < minimum) | (numbers >= bound))
+        if len(bad):
+            where = tuple(int(i) for i in bad[0])
+            raise ValueError(
+                f"{name}: wanted indices in [{minimum}, {bound}), got {numbers[where]} at index"
+                f" {where} ({len(bad)} such value{'s' if len(bad) > 1 else ''})"
+            )
+    return array.astype(jnp.int32)
+
+
+def real_number(name: str, value: Any, *, above: float = -np.inf, below: float = np.inf) -> Array:
+    """Convert to a floating-point scalar; where its value is known, above < value < below."""
+    number = float_array(name, value, ())
+    if is_concrete(number) and not above < float(number) < below:
+        raise ValueError(
+            f"{name}: wanted a number between {above:g} and {below:g}, got {float(number):g}"
+        )
+    return number
+
+
+def positive_int(name: str, value: Any, *, minimum: int = 1) -> int:
+    """Check a static count or size."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ValueError(f"{name}: wanted an integer of at least {minimum}, got {_brief(value)}")
+    return int(value)
+
+
+def one_of(name: str, value: Any, choices: tuple[str, ...]) -> str:
+    """Check a choice by name."""
+    if value not in choices:
+        raise ValueError(f"{name}: wanted one of {', '.join(choices)}, got {_brief(value)}")
+    return value
+
+
+def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...] | None) -> None:
+    if wanted is None:
+        return
+    if wanted and wanted[0] == "..." and len(got) >= len(wanted) - 1:
+        wanted = (*got[: len(got) - len(wanted) + 1], *wanted[1:])
+    sizes: dict[str, int] = {}
+    fits = len(got) == len(wanted) and all(
+        size == want if isinstance(want, int) else sizes.setdefault(want, size) == size
+        for size, want in zip(got, wanted, strict=True)
+    )
+    if not fits:
+        text = ", ".join(str(want) for want in wanted) + ("," if len(wanted) == 1 else "")
+        raise ValueError(f"{name}: wanted shape ({text}), got {got}")
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

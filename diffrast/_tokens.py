@@ -1,0 +1,67 @@
+"""Words of a text file, each with its line, for errors that say where."""
+
+import re
+
+_COMMENT = re.compile(r"\{[^{}]*(\}|\Z)")
+
+
+class Tokens:
+    """Reads white-space separated words one after another; {...} is a comment.
+
+    Every method raises `ValueError` "name:line: wanted ..., got ..." when the next word will not
+    do.
+    """
+
+    def __init__(self, text: str, name: str) -> None:
+        visible = _COMMENT.sub(lambda comment: re.sub(r"[^\n]", " ", comment[0]), text)
+        self._name = name
+        self._words = [
+            (word, line)
+            for line, content in enumerate(visible.split("\n"), start=1)
+            for word in content.split()
+        ]
+        self._last_line = len(text.splitlines())
+        self._next = 0
+
+    def word(self, wanted: str) -> str:
+        """The next word, whatever it is."""
+        if self._next == len(self._words):
+            raise ValueError(
+                f"{self._name}:{self._last_line}: wanted {wanted}, got the end of the file"
+            )
+        self._next += 1
+        return self._words[self._next - 1][0]
+
+    def number(self, wanted: str) -> float:
+        """The next word as a finite number."""
+        word = self.word(wanted)
+        try:
+            value = float(word)
+        except ValueError:
+            value = float("nan")
+        if not abs(value) < float("inf"):
+            raise self.error(wanted)
+        return value
+
+    def integer(self, wanted: str, minimum: int, bound: int | None = None) -> int:
+        """The next word as an integer of at least `minimum` and below `bound`."""
+        word = self.word(wanted)
+        try:
+            value = int(word)
+        except ValueError:
+            raise self.error(wanted) from None
+        if value < minimum or (bound is not None and value >= bound):
+            limits = f"of at least {minimum}" if bound is None else f"in [{minimum}, {bound})"
+            raise self.error(f"{wanted}, an integer {limits}")
+        return value
+
+    def end(self) -> None:
+        """Nothing may follow."""
+        if self._next < len(self._words):
+            self._next += 1
+            raise self.error("the end of the file")
+
+    def error(self, wanted: str) -> ValueError:
+        """The error that the word just read is not what was wanted."""
+        word, line = self._words[self._next - 1]
+        return ValueError(f"{self._name}:{line}: wanted {wanted}, got {word!r}")

@@ -1,0 +1,299 @@
+"""Who touches whom in a mesh: welding, edges, polygons. Plain NumPy on the host, no derivatives.
+
+Topology is discrete and is made once per mesh, outside anything that JAX traces; `diffrast.mesh`
+checks the arguments, converts between JAX and NumPy, and is the public face of this file.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+class EdgeAdjacency(NamedTuple):
+    """Every edge once, with the faces that meet there; all arrays are int32.
+
+    Attributes:
+        edges: vertex ids (start, end) of the edge, as the first face has them and in the
+            direction in which that face, seen from outside, goes round counter-clockwise.
+        edge_faces: ids of the face on the left of the edge and of the one beyond it; −1 where
+            nothing is beyond (a boundary).
+        opposite: for each of the two faces the vertex that is not on the edge; −1 likewise.
+    """
+
+    edges: Int[np.ndarray, "edges 2"]
+    edge_faces: Int[np.ndarray, "edges 2"]
+    opposite: Int[np.ndarray, "edges 2"]
+
+
+class HalfEdges(NamedTuple):
+    """The directed edges of all faces with three distinct corners, three to a face."""
+
+    corners: Int[np.ndarray, "half_edges 3"]  # start, end and opposite vertex as in `faces`
+    face: Int[np.ndarray, "half_edges"]
+    low_to_high: Bool[np.ndarray, "half_edges"]  # direction, by welded vertex id
+    key: Int[np.ndarray, "half_edges"]  # equal for the half-edges of one edge
+
+
+def representatives(positions: Any, xp: Any = np) -> Any:
+    """Index of the first row that equals each row of `positions`.
+
+    Args:
+        positions: shape (vertices, 3).
+        xp: `numpy`, or `jax.numpy` for positions that are being traced.
+    """
+    positions = xp.where(positions == 0, 0, positions)  # −0 and 0 are one place
+    order = xp.lexsort(positions.T)  # stable: equal rows stay in the order of their index
+    ordered = positions[order]
+    changes = xp.any(ordered[1:] != ordered[:-1], axis=1)
+    group = xp.concatenate([xp.zeros(1, dtype=int), xp.cumsum(changes)])
+    first = order[xp.searchsorted(group, group)]
+    return first[xp.argsort(order)].astype(np.int32)
+
+
+def half_edges(positions: np.ndarray, faces: np.ndarray) -> HalfEdges:
+    """Directed edges over vertices welded by exact position.
+
+    A face two of whose corners lie at one place has no inside; it is left out, so that its
+    neighbours meet each other.
+    """
+    welded = representatives(positions)[faces]
+    proper = np.all(welded != np.roll(welded, 1, axis=1), axis=1)
+    faces, welded = faces[proper], welded[proper].astype(np.int64)
+    corners = np.stack([faces, np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=2)
+    start, end = welded.reshape(-1), np.roll(welded, -1, axis=1).reshape(-1)
+    key = np.minimum(start, end) * len(positions) + np.maximum(start, end)
+    return HalfEdges(corners.reshape(-1, 3), np.repeat(np.flatnonzero(proper), 3), start < end, key)
+
+
+def edge_adjacency(positions: np.ndarray, faces: np.ndarray) -> EdgeAdjacency:
+    """Pair the half-edges of every edge; see `diffrast.mesh.edge_adjacency`."""
+    half = half_edges(positions, faces)
+    _, group, counts = np.unique(half.key, return_inverse=True, return_counts=True)
+    turn = np.zeros(len(group))
+    crowded = np.flatnonzero(counts[group] > 2)
+    if crowded.size:
+        turn[crowded] = _turns(positions.astype(np.float64), half, group, crowded)
+    # Stable: the two half-edges of an ordinary edge stay in the order of their faces.
+    order = np.lexsort((~half.low_to_high & (turn > 0), turn, group))
+    place = np.arange(len(order)) - (np.cumsum(counts) - counts)[group[order]]
+    is_first = place % 2 == 0
+    has_partner = is_first & (place + 1 < counts[group[order]])
+    first = order[is_first]
+    partner = order[np.flatnonzero(is_first) + has_partner[is_first]]
+    beyond = has_partner[is_first]
+    edge_faces = np.stack([half.face[first], np.where(beyond, half.face[partner], -1)], axis=1)
+    opposite = np.stack(
+        [half.corners[first, 2], np.where(beyond, half.corners[partner, 2], -1)], axis=1
+    )
+    edges = half.corners[first, :2]
+    return EdgeAdjacency(*(a.astype(np.int32) for a in (edges, edge_faces, opposite)))
+
+
+def _turns(
+    positions: np.ndarray, half: HalfEdges, group: np.ndarray, crowded: np.ndarray
+) -> np.ndarray:
+    """Angle of each face about its edge, where more than two faces meet there.
+
+    Looking along the edge from its lower to its higher vertex, solid lies between a face that
+    goes high to low and the next one, at a larger angle, that goes low to high. Counting angles
+    from a face of the first kind, neighbours in the order of angles bound one wedge of solid.
+    """
+    backward = ~half.low_to_high[crowded]
+    order = np.lexsort((~backward, group[crowded]))
+    _, first = np.unique(group[crowded][order], return_index=True)
+    sizes = np.diff(np.append(first, len(order)))
+    reference = np.empty(len(order), dtype=int)
+    reference[order] = np.repeat(order[first], sizes)
+
+    corners = half.corners[crowded]
+    low = np.where(backward, corners[:, 1], corners[:, 0])
+    high = np.where(backward, corners[:, 0], corners[:, 1])
+    axis = positions[high] - positions[low]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    arm = positions[corners[:, 2]] - positions[low]
+    arm -= np.sum(arm * axis, axis=1, keepdims=True) * axis
+    zero = arm[reference]
+    sine = np.sum(np.cross(axis, zero) * arm, axis=1)
+    # Rounding keeps faces that lie on one another at the same angle.
+    angle = np.round(np.arctan2(sine, np.sum(zero * arm, axis=1)) % (2 * np.pi), 6)
+    full = np.round(2 * np.pi, 6)
+    return np.where(backward, np.where(angle == full, 0, angle), np.where(angle == 0, full, angle))
+
+
+def clusters(positions: np.ndarray, tolerance: float) -> np.ndarray:
+    """Lowest index of the vertices linked to each vertex by steps of at most `tolerance`."""
+    label = np.arange(len(positions))
+    first, second = _near_pairs(positions, tolerance)
+    while np.any(label[first] != label[second]):
+        lowest = np.minimum(label[first], label[second])
+        np.minimum.at(label, first, lowest)
+        np.minimum.at(label, second, lowest)
+        label = label[label]
+    return label
+
+
+def _near_pairs(positions: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of vertices at most `tolerance` apart, except between copies of one place.
+
+    Sweeps along a direction askew to everything: points that are near have near heights.
+    """
+    first_copy = representatives(positions)
+    copies = np.flatnonzero(first_copy != np.arange(len(first_copy)))
+    pairs = [(copies, first_copy[copies])]
+    places = np.flatnonzero(first_copy == np.arange(len(first_copy)))
+    height = positions[places] @ np.array([0.6123, 0.5417, 0.5761])
+    order = np.argsort(height)
+    places, height = places[order], height[order]
+    step = 1
+    while step < len(places) and np.any(height[step:] - height[:-step] <= tolerance):
+        candidate = np.flatnonzero(height[step:] - height[:-step] <= tolerance)
+        first, second = places[candidate], places[candidate + step]
+        near = np.linalg.norm(positions[first] - positions[second], axis=1) <= tolerance
+        pairs.append((first[near], second[near]))
+        step += 1
+    return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
+
+
+def join_indices(polygons: Sequence[Any] | np.ndarray, bound: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex ids of all polygons end to end, and the number of corners of each.
+
+    Raises:
+        ValueError: for anything but lists of ids in [0, bound).
+    """
+    lists = [np.asarray(polygon) for polygon in polygons]
+    for number, ids in enumerate(lists):
+        if ids.ndim != 1 or (ids.size and not np.issubdtype(ids.dtype, np.integer)):
+            raise ValueError(f"polygons: wanted a list of vertex ids, got {ids} at {number}")
+        if ids.size and (ids.min() < 0 or ids.max() >= bound):
+            raise ValueError(
+                f"polygons: wanted vertex ids in [0, {bound}), got {ids.tolist()} at {number}"
+            )
+    sizes = np.array([len(ids) for ids in lists], dtype=int)
+    return np.concatenate([np.zeros(0, dtype=int), *lists]).astype(int), sizes
+
+
+class Polygons(NamedTuple):
+    """Polygons of any number of corners, end to end, with their unit normals."""
+
+    corner: Int[np.ndarray, "corners"]  # vertex ids
+    polygon: Int[np.ndarray, "corners"]  # position in the caller's list
+    start: Int[np.ndarray, "polygons"]  # where each polygon begins
+    size: Int[np.ndarray, "polygons"]
+    normal: Float[np.ndarray, "polygons 3"]
+    area: Float[np.ndarray, "polygons"]
+
+
+def join_polygons(positions: np.ndarray, corner: np.ndarray, sizes: np.ndarray) -> Polygons:
+    """Drop corners that repeat the next one's place, then polygons without area.
+
+    The normal is Newell's: the direction of the area vector, which every corner has a say in.
+    """
+    polygon = np.repeat(np.arange(len(sizes)), sizes)
+    place = representatives(positions)[corner]
+    keep = place != place[_next(polygon)]
+    corner, polygon = corner[keep], polygon[keep]
+    if len(corner):
+        area_vector, perimeter = _newell(positions, corner, polygon, len(sizes))
+        area = np.linalg.norm(area_vector, axis=1)
+        flat = area <= 16 * np.finfo(np.float64).eps * perimeter**2
+        keep = ~flat[polygon]
+        corner, polygon = corner[keep], polygon[keep]
+    if not len(corner):
+        raise ValueError("polygons: wanted at least one with three corners and an area, got none")
+    ids, start, size = np.unique(polygon, return_index=True, return_counts=True)
+    normal = area_vector[ids] / area[ids, None]
+    return Polygons(corner, polygon, start, size, normal, area[ids])
+
+
+def _next(polygon: np.ndarray) -> np.ndarray:
+    """Index of the corner after each corner, round its polygon."""
+    starts = np.flatnonzero(np.diff(polygon, prepend=-1))
+    following = np.arange(1, len(polygon) + 1)
+    following[np.append(starts, len(polygon))[1:] - 1] = starts
+    return following
+
+
+def _newell(
+    positions: np.ndarray, corner: np.ndarray, polygon: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Area vector and perimeter of every polygon."""
+    starts = np.flatnonzero(np.diff(polygon, prepend=-1))
+    first = np.repeat(starts, np.diff(np.append(starts, len(polygon))))
+    here, after = positions[corner], positions[corner[_next(polygon)]]
+    origin = positions[corner[first]]
+    area_vector, perimeter = np.zeros((count, 3)), np.zeros(count)
+    area_vector[polygon[starts]] = (
+        np.add.reduceat(np.cross(here - origin, after - origin), starts) / 2
+    )
+    perimeter[polygon[starts]] = np.add.reduceat(np.linalg.norm(after - here, axis=1), starts)
+    return area_vector, perimeter
+
+
+def triangulate(positions: np.ndarray, polygons: Polygons) -> np.ndarray:
+    """Triangles as indices into `polygons.corner`, polygon after polygon, shape (faces, 3).
+
+    A convex polygon becomes the fan round its first corner; others are cut ear by ear.
+    """
+    corner, polygon = polygons.corner, polygons.polygon
+    following = _next(polygon)
+    previous = np.argsort(following)
+    index = np.repeat(np.arange(len(polygons.start)), polygons.size)
+    here = positions[corner]
+    turn = np.cross(here - here[previous], here[following] - here)
+    is_left = np.sum(turn * polygons.normal[index], axis=1) > 0
+    convex = np.logical_and.reduceat(is_left, polygons.start)
+
+    start = polygons.start[index]
+    local = np.arange(len(corner)) - start
+    middle = np.flatnonzero(convex[index] & (local >= 1) & (local < polygons.size[index] - 1))
+    triangles = [np.stack([start[middle], middle, middle + 1], axis=1)]
+    for concave in np.flatnonzero(~convex):
+        begin, size = polygons.start[concave], polygons.size[concave]
+        outline = _project(here[begin : begin + size], polygons.normal[concave])
+        triangles.append(begin + np.array(clip_ears(outline)))
+    faces = np.concatenate(triangles)
+    return faces[np.argsort(polygon[faces[:, 0]], kind="stable")]
+
+
+def _project(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Drop the coordinate along which the plane is seen best, keeping the sense of rotation."""
+    dropped = int(np.argmax(np.abs(normal)))
+    kept = [(dropped + 1) % 3, (dropped + 2) % 3]
+    return (points - points[0])[:, kept if normal[dropped] > 0 else kept[::-1]]
+
+
+def clip_ears(outline: np.ndarray) -> Sequence[tuple[int, int, int]]:
+    """Cut a simple counter-clockwise polygon (corners, 2) into triangles, ear by ear.
+
+    An ear is a left turn whose triangle holds no other corner. Where an outline that crosses
+    itself leaves none, the sharpest left turn is taken, so the cutting always ends.
+    """
+    remaining = np.arange(len(outline))
+    triangles = []
+    while len(remaining) > 3:
+        here = outline[remaining]
+        around = np.stack([np.roll(here, 1, axis=0), here, np.roll(here, -1, axis=0)], axis=1)
+        turn = _cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 1])
+        left = np.flatnonzero(turn > 0)
+        ear = next((i for i in left if not _holds(around[i], here)), int(np.argmax(turn)))
+        around_ear = np.roll(remaining, 1 - ear)[:3]
+        triangles.append(_three(around_ear))
+        remaining = np.delete(remaining, ear)
+    return [*triangles, _three(remaining)]
+
+
+def _holds(triangle: np.ndarray, points: np.ndarray) -> bool:
+    """Whether a point other than its corners lies in the triangle or on its rim."""
+    others = points[~np.any(np.all(points[:, None] == triangle, axis=2), axis=1)]
+    sides = [_cross(triangle[k] - triangle[k - 1], others - triangle[k - 1]) for k in range(3)]
+    return bool(np.any(np.all(np.stack(sides) >= 0, axis=0)))
+
+
+def _three(ids: np.ndarray) -> tuple[int, int, int]:
+    return int(ids[0]), int(ids[1]), int(ids[2])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

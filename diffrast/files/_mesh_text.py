@@ -1,0 +1,217 @@
+"""What the mesh reader passes over in silence: the lines of text formats, checked one by one.
+
+trimesh counts OBJ's relative indices from the end of the file instead of from the face, takes the
+first vertex for index 0, accepts OFF and PLY files that end early, and does not say where a file
+is broken. Each check here raises `ValueError` "file:line: wanted ..., got ...".
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+_OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
+
+
+def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
+    """The geometry of an OBJ file in its plainest form, checked.
+
+    Triangles only (polygons as fans), indices from the start of the file, one blank between
+    words, the same kind of corner (v, v/vt, v//vn, v/vt/vn) everywhere: texture coordinates and
+    normals are kept where all corners have them. Groups, objects, lines and colours are dropped.
+    """
+    counts = dict.fromkeys(_OBJ_SIZES, 0)
+    vertices: list[str] = []
+    faces: list[tuple[int, list[list[int]]] | str] = []
+    for line, words in _obj_lines(text):
+        key = words[0]
+        if key in counts:
+            counts[key] += 1
+            vertices.append(" ".join([key, *_obj_numbers(words, f"{name}:{line}")]))
+        elif key == "f":
+            faces.append((line, _obj_corners(words[1:], counts, f"{name}:{line}")))
+        elif keep_materials and key in ("mtllib", "usemtl"):
+            faces.append(" ".join(words))
+    corners = [corner for face in faces if not isinstance(face, str) for corner in face[1]]
+    used = [all(corner[k] for corner in corners) for k in range(3)]
+    lines = []
+    for face in faces:
+        if isinstance(face, str):
+            lines.append(face)
+            continue
+        _obj_in_range(face, counts, name)
+        written = ["/".join(_obj_corner(corner, used)) for corner in face[1]]
+        lines += [f"f {written[0]} {b} {c}" for b, c in zip(written[1:], written[2:], strict=False)]
+    return "\n".join([*vertices, *lines, ""])
+
+
+def _obj_lines(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Words of every line that has any, with the number of its first line."""
+    pending, first = "", 0
+    for number, line in enumerate(text.splitlines(), start=1):
+        first = first if pending else number
+        content = pending + line.split("#")[0]
+        if content.endswith("\\"):
+            pending = content[:-1] + " "
+            continue
+        pending = ""
+        words = content.split()
+        if words:
+            yield first, words
+
+
+def _obj_numbers(words: list[str], where: str) -> list[str]:
+    size = _OBJ_SIZES[words[0]]
+    numbers = words[1 : 1 + size]
+    if words[0] == "vt" and len(numbers) == 1:
+        numbers = [*numbers, "0"]
+    if len(numbers) < size or not all(_is_finite(word) for word in numbers):
+        raise ValueError(
+            f"{where}: wanted {size} numbers after {words[0]}, got {_quote(words[1:])}"
+        )
+    return numbers
+
+
+def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[list[int]]:
+    """Indices (v, vt, vn) of each corner, from 1; 0 where the corner has none."""
+    if len(words) < 3:
+        raise ValueError(f"{where}: wanted at least 3 corners after f, got {_quote(words)}")
+    corners = []
+    for word in words:
+        fields = word.split("/")
+        corner = [0, 0, 0]
+        for k, (field, count) in enumerate(zip(fields, counts.values(), strict=False)):
+            if not field and k > 0:
+                continue
+            try:
+                index = int(field)
+            except ValueError:
+                index = 0
+            if index == 0 or index < -count or len(fields) > 3:
+                raise ValueError(
+                    f"{where}: wanted a corner v, v/vt, v//vn or v/vt/vn with indices from 1 or"
+                    f" back to -{count}, got {word!r}"
+                )
+            corner[k] = index if index > 0 else count + 1 + index
+        corners.append(corner)
+    return corners
+
+
+def _obj_in_range(face: tuple[int, list[list[int]]], counts: dict[str, int], name: str) -> None:
+    for corner in face[1]:
+        for index, (key, count) in zip(corner, counts.items(), strict=True):
+            if index > count:
+                raise ValueError(
+                    f"{name}:{face[0]}: wanted an index of at most {count}, the number of {key} in"
+                    f" the file, got {index}"
+                )
+
+
+def _obj_corner(corner: list[int], used: list[bool]) -> list[str]:
+    fields = [str(index) if use else "" for index, use in zip(corner, used, strict=True)]
+    return fields[: 1 + max(k for k in range(3) if used[k])]
+
+
+def check_off(text: str, name: str) -> None:
+    """Check that an OFF file has the vertices and faces that it announces."""
+    lines = [(n, w) for n, w in _numbered(text) if w]
+    if not lines or not lines[0][1][0].endswith("OFF"):
+        raise ValueError(f"{name}:1: wanted the word OFF, got {_quote(text.split()[:1])}")
+    number, words = lines[0]
+    rest = lines[1:] if len(words) == 1 else [(number, words[1:]), *lines[1:]]
+    if not rest:
+        raise ValueError(f"{name}:{number}: wanted the numbers of vertices and faces, got the end")
+    number, words = rest[0]
+    if len(words) < 2 or not all(word.isdigit() for word in words[:2]):
+        raise ValueError(
+            f"{name}:{number}: wanted the numbers of vertices and faces, got {_quote(words)}"
+        )
+    vertices, faces = int(words[0]), int(words[1])
+    body = iter(rest[1:])
+    for k in range(vertices):
+        number, words = _next_line(body, f"vertex {k}", name, number)
+        if len(words) < 3 or not all(_is_finite(word) for word in words[:3]):
+            raise ValueError(f"{name}:{number}: wanted three numbers, got {_quote(words)}")
+    for k in range(faces):
+        number, words = _next_line(body, f"face {k}", name, number)
+        _check_indices(words, vertices, f"{name}:{number}")
+
+
+def check_ascii_ply(text: str, name: str) -> None:
+    """Check that a text PLY file has the elements that its header announces."""
+    lines = _numbered(text)
+    elements: list[tuple[str, int, list[str]]] = []
+    number = 0
+    for number, words in lines:
+        if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and elements:
+            elements[-1][2].append("list" if words[1] == "list" else "scalar")
+        elif words[:1] == ["end_header"]:
+            break
+    vertices = sum(count for element, count, _ in elements if element == "vertex")
+    for element, count, properties in elements:
+        for k in range(count):
+            number, words = _next_line(lines, f"{element} {k}", name, number)
+            scalars = properties.count("scalar")
+            if len(words) < scalars or not all(_is_finite(word) for word in words):
+                raise ValueError(
+                    f"{name}:{number}: wanted {scalars or 'several'} numbers for {element} {k},"
+                    f" got {_quote(words)}"
+                )
+            if element == "face" and properties[:1] == ["list"]:
+                _check_indices(words, vertices, f"{name}:{number}")
+
+
+def check_ascii_stl(text: str, name: str) -> None:
+    """Check that a text STL file has facets of three vertices, and an end."""
+    corners, number = 0, 0
+    for number, words in _numbered(text):
+        key = words[0].lower() if words else ""
+        if key == "vertex":
+            corners += 1
+            if len(words) != 4 or not all(_is_finite(word) for word in words[1:]):
+                raise ValueError(f"{name}:{number}: wanted three numbers, got {_quote(words[1:])}")
+        elif key in ("endloop", "endfacet", "endsolid") and corners % 3:
+            raise ValueError(f"{name}:{number}: wanted facets of three vertices, got {key} early")
+        ended = key == "endsolid" if key else number > 1 and ended
+    if not ended:
+        raise ValueError(f"{name}:{number}: wanted endsolid, got the end of the file")
+
+
+def _numbered(text: str) -> Iterator[tuple[int, list[str]]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        yield number, line.split("#")[0].split()
+
+
+def _next_line(
+    lines: Iterator[tuple[int, list[str]]], wanted: str, name: str, number: int
+) -> tuple[int, list[str]]:
+    """The next line that is not empty."""
+    for number, words in lines:
+        if words:
+            return number, words
+    raise ValueError(f"{name}:{number}: wanted {wanted}, got the end of the file")
+
+
+def _check_indices(words: list[str], bound: int, where: str) -> None:
+    """A number of corners and as many vertex ids, perhaps more."""
+    size = int(words[0]) if words[0].isdigit() else 0
+    ids = words[1 : 1 + size]
+    fits = size >= 3 and len(ids) == size
+    if not (fits and all(word.isdigit() and int(word) < bound for word in ids)):
+        raise ValueError(
+            f"{where}: wanted a number of corners and as many indices in [0, {bound}), got"
+            f" {_quote(words)}"
+        )
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return bool(np.isfinite(float(word)))
+    except ValueError:
+        return False
+
+
+def _quote(words: list[str]) -> str:
+    text = " ".join(words)
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,185 @@
+"""Images in and out, through Pillow: linear RGB here, sRGB in the file."""
+
+import struct
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float32, UInt8
+from PIL import Image, ImageFile, ImageOps
+
+from diffrast._check import ArrayInput, float_array, real_number
+from diffrast.color import linear_to_srgb, srgb_to_linear
+
+# What Pillow raises for files that are no images, or broken ones. OSError is the common one.
+_BROKEN = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+
+
+def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height width channels"]:
+    """Read an image as linear RGB, or RGB and alpha where the file has transparency.
+
+    Reads what Pillow reads, 8 or 16 bits a channel: PNG, JPEG, ... Grey and palette images become
+    RGB. A photograph's orientation mark is obeyed. Alpha is not premultiplied and never decoded.
+
+    Args:
+        path: the file.
+        srgb: the file holds sRGB colours, as pictures do. False for data such as roughness or
+            normals: the numbers are only scaled to 0 to 1.
+
+    Raises:
+        ValueError: with the file's name, for a file that cannot be read as an image.
+        FileNotFoundError: for a file that is not there.
+    """
+    try:
+        with Image.open(path) as image:
+            values = _deep_channels(image, path)
+            if values is None:
+                values = _channels(ImageOps.exif_transpose(image))
+    except FileNotFoundError:
+        raise
+    except _BROKEN as error:
+        raise ValueError(f"{path}: cannot be read as an image ({error})") from error
+    if srgb:
+        color = srgb_to_linear(values[..., :3])
+        return jnp.concatenate([color, values[..., 3:]], axis=-1)
+    return jnp.asarray(values)
+
+
+def save_image(path: str | Path, image: ArrayInput, *, srgb: bool = True) -> None:
+    """Write a linear image as 8 bits a channel, in the format that the file's name ends in.
+
+    Args:
+        path: the file; its folder must exist.
+        image: (height, width, 3) or with alpha (..., 4), or grey (height, width). Values are
+            clamped to 0 to 1.
+        srgb: encode the colours as sRGB, as pictures are. False for data.
+
+    Raises:
+        ValueError: for other shapes, whole numbers (which would be 0 to 255, not 0 to 1), NaN and
+            infinity, and formats that Pillow cannot write.
+        FileNotFoundError: for a folder that is not there.
+    """
+    _write(path, [Image.fromarray(_to_bytes("image", image, srgb))])
+
+
+def save_animation(
+    path: str | Path,
+    images: Iterable[ArrayInput],
+    *,
+    frames_per_second: float = 20.0,
+    srgb: bool = True,
+) -> None:
+    """Write linear images as an endlessly repeated GIF of at most 256 colours a frame.
+
+    Args:
+        path: the file, ending in .gif; its folder must exist.
+        images: equal in size, each as for `save_image`.
+        frames_per_second: at most 100. GIF rounds the time of a frame to 1/100 s.
+        srgb: as for `save_image`.
+
+    Raises:
+        ValueError: as for `save_image`, and for no images or images of different sizes.
+        FileNotFoundError: for a folder that is not there.
+    """
+    rate = float(real_number("frames_per_second", frames_per_second, above=0.0))
+    if rate > 100:
+        raise ValueError(f"frames_per_second: wanted at most 100, got {rate:g}")
+    if Path(path).suffix.lower() != ".gif":
+        raise ValueError(f"path: wanted a name that ends in .gif, got {path}")
+    frames = [_to_bytes(f"images[{i}]", image, srgb) for i, image in enumerate(images)]
+    for index, frame in enumerate(frames):
+        if frame.shape != frames[0].shape:
+            raise ValueError(
+                f"images: wanted equal shapes, got {frames[0].shape} at index 0 and"
+                f" {frame.shape} at index {index}"
+            )
+    if not frames:
+        raise ValueError("images: wanted at least one, got none")
+    duration = 10 * round(100 / rate)  # in milliseconds
+    _write(path, [Image.fromarray(f) for f in frames], save_all=True, duration=duration, loop=0)
+
+
+def _channels(image: Image.Image) -> Float32[np.ndarray, "height width channels"]:
+    """RGB or RGBA of an image of 8 bits a channel."""
+    if image.mode == "F" or image.mode.startswith("I"):
+        raise ValueError(f"wanted 8 or 16 bits a channel, got mode {image.mode}")
+    transparent = "A" in image.getbands() or "transparency" in image.info
+    return _unit(np.asarray(image.convert("RGBA" if transparent else "RGB")), 255)
+
+
+def _deep_channels(
+    image: ImageFile.ImageFile, path: str | Path
+) -> Float32[np.ndarray, "height width channels"] | None:
+    """RGB or RGBA of an image of 16 bits a channel; None for any other.
+
+    Pillow keeps 16 bits of grey only. Of PNG colours it drops the lower byte; read as if the bytes
+    stood the other way round it drops the upper one.
+    """
+    if image.mode == "I;16" or (image.mode == "I" and image.format == "PNG"):
+        grey = np.asarray(image)[..., None]
+        return _unit(np.repeat(grey, 3, axis=-1), 65535)
+    raw_mode = image.tile[0][3] if image.format == "PNG" and image.tile else ""
+    if "transparency" in image.info or raw_mode not in ("RGB;16B", "RGBA;16B", "LA;16B"):
+        return None
+    if raw_mode == "LA;16B":  # four bytes a pixel, as 8-bit RGBA has
+        grey_high, grey_low, alpha_high, alpha_low = np.moveaxis(_decode(path, "RGBA"), -1, 0)
+        high = np.stack([grey_high, grey_high, grey_high, alpha_high], axis=-1)
+        low = np.stack([grey_low, grey_low, grey_low, alpha_low], axis=-1)
+    else:
+        high, low = _decode(path, raw_mode), _decode(path, raw_mode.replace("16B", "16L"))
+    return _unit(high.astype(np.uint16) * 256 + low, 65535)
+
+
+def _decode(path: str | Path, raw_mode: str) -> UInt8[np.ndarray, "height width channels"]:
+    """Pixels of a PNG, its bytes understood as `raw_mode`."""
+    with Image.open(path) as image:
+        tiles: Any = [(*tile[:3], raw_mode) for tile in image.tile]
+        image.tile = tiles
+        return np.array(image)
+
+
+def _unit(values: np.ndarray, full: int) -> np.ndarray:
+    return values.astype(np.float32) / np.float32(full)
+
+
+def _to_bytes(name: str, image: ArrayInput, srgb: bool) -> UInt8[np.ndarray, "height width *c"]:
+    dtype = jnp.result_type(image) if hasattr(image, "dtype") else np.asarray(image).dtype
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"{name}: wanted floating-point values from 0 to 1, got dtype {dtype}")
+    values = float_array(name, image)
+    channels = values.shape[2:] or (1,)
+    if values.ndim not in (2, 3) or values.size == 0 or channels not in ((1,), (3,), (4,)):
+        raise ValueError(
+            f"{name}: wanted shape (height, width, 3 or 4) or (height, width), got {values.shape}"
+        )
+    values = jnp.clip(values.reshape(*values.shape[:2], *channels), 0, 1)
+    if srgb:
+        color = linear_to_srgb(values[..., :3])
+        values = jnp.concatenate([color, values[..., 3:]], axis=-1)
+    pixels = np.asarray(jnp.round(values * 255)).astype(np.uint8)
+    return pixels[..., 0] if channels == (1,) else pixels
+
+
+def _write(path: str | Path, frames: list[Image.Image], **options: Any) -> None:
+    if not Path(path).parent.is_dir():
+        raise FileNotFoundError(f"{path}: its folder does not exist")
+    if len(frames) > 1:
+        options["append_images"] = frames[1:]
+    try:
+        frames[0].save(path, **options)
+    except (ValueError, OSError) as error:
+        if getattr(error, "errno", None) is not None:  # a full disk is no matter of values
+            raise
+        raise ValueError(f"{path}: cannot be written as an image ({error})") from error

@@ -1,0 +1,308 @@
+"""Meshes in and out: OBJ, PLY, STL, OFF, glTF and GLB (FEATURES G9).
+
+Reading goes through trimesh, an optional dependency (`pip install diffrast[mesh]`), told to
+change nothing: no merging, no reordering, no guessing of normals. `diffrast.files._mesh_text`
+checks text formats first.
+"""
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from diffrast.color import srgb_to_linear
+from diffrast.files._mesh_text import check_ascii_ply, check_ascii_stl, check_off, plain_obj
+from diffrast.linalg import normalize
+from diffrast.mesh import Mesh, merge, transform, with_normals
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+
+
+class MeshPart(NamedTuple):
+    """The faces of a file that share a material; what the file does not say is `None`."""
+
+    name: str
+    mesh: Mesh
+    ambient: Float[np.ndarray, "3"] | None = None
+    diffuse: Float[np.ndarray, "3"] | None = None
+    specular: Float[np.ndarray, "3"] | None = None
+    shininess: float | None = None
+    texture: Float[np.ndarray, "height width channels"] | None = None
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a mesh from an OBJ, PLY, STL, OFF, glTF or GLB file.
+
+    Polygons are cut into fans, several geometries are merged in their places. Vertex normals and
+    texture coordinates are those of the file, else `None` (`with_normals` makes smooth normals);
+    where only some geometries have them the others get area-weighted normals, or uv (0, 0). An
+    OBJ vertex that occurs with several texture coordinates or normals is split. STL files hold
+    triangles with their own corners and no vertex normals.
+
+    Args:
+        path: the file; its suffix names the format.
+
+    Raises:
+        ImportError: when trimesh is not installed.
+        ValueError: with the file's name, and the line in text formats, for an unknown suffix, a
+            broken file, or a file without faces.
+        OSError: when the file cannot be opened.
+    """
+    return _merged([part.mesh for part in _read_parts(Path(path), materials=False)])
+
+
+def load_mesh_parts(path: str | Path) -> list[MeshPart]:
+    """Read a mesh with its materials, one part for each.
+
+    Colours (of an OBJ file's MTL: Ka, Kd, Ks, Ns; of glTF: the base colour) are the file's
+    numbers. Textures are linear RGB or RGBA, row 0 at the top; v of the uvs points up. A material
+    file or picture that cannot be found leaves `None`.
+
+    Raises:
+        As `load_mesh`.
+    """
+    return _read_parts(Path(path), materials=True)
+
+
+def save_mesh(path: str | Path, mesh: Mesh) -> None:
+    """Write a mesh in the format that the file's suffix names.
+
+    OBJ, PLY, glTF and GLB hold normals and texture coordinates, OFF and STL only faces. Text
+    formats have enough digits to read the same numbers back; binary ones hold float32.
+
+    Raises:
+        ImportError: when trimesh is not installed (PLY, STL, glTF, GLB).
+        ValueError: for an unknown suffix.
+        OSError: when the file cannot be written.
+    """
+    path = Path(path)
+    suffix = _known_suffix(path)
+    if suffix == ".obj":
+        path.write_text(_obj_text(mesh), encoding="ascii")
+    elif suffix == ".off":
+        path.write_text(_off_text(mesh), encoding="ascii")
+    else:
+        with _quiet_trimesh() as trimesh:
+            content = _exported(trimesh, mesh, suffix)
+        path.write_bytes(content)
+
+
+# --------------------------------------------------------------------------------------- reading
+
+
+def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
+    suffix = _known_suffix(path)
+    content = path.read_bytes()
+    with _quiet_trimesh() as trimesh:
+        content, options = _checked(content, suffix, path, materials)
+        try:
+            scene = trimesh.load_scene(
+                io.BytesIO(content),
+                file_type=suffix[1:],
+                resolver=trimesh.resolvers.FilePathResolver(str(path)),
+                process=False,
+                skip_materials=not materials,
+                **options,
+            )
+            parts = [part for part in _scene_parts(trimesh, scene) if part is not None]
+        # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
+        except Exception as error:
+            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+            raise ValueError(
+                f"{path}: cannot be read as {suffix[1:].upper()} ({kind}{error})"
+            ) from error
+    if not parts:
+        raise ValueError(f"{path}: wanted a mesh with faces, got none")
+    return parts[::-1] if suffix == ".obj" else parts  # trimesh takes materials from the end
+
+
+def _checked(
+    content: bytes, suffix: str, path: Path, materials: bool
+) -> tuple[bytes, dict[str, Any]]:
+    """Check text formats; what to give to trimesh, and how."""
+    name = str(path)
+    if suffix == ".obj":
+        text = plain_obj(_text(content, name), name, keep_materials=materials)
+        # Keeping the order is right only where there is nothing to split vertices for.
+        return text.encode(), {"maintain_order": "/" not in text.partition("\nf ")[2]}
+    if suffix == ".off":
+        check_off(_text(content, name), name)
+    elif suffix == ".ply":
+        header = content.partition(b"end_header")[0]
+        if b"format ascii" in header:
+            check_ascii_ply(_text(content, name), name)
+        return content, {"fix_texture": b"texcoord" in header}
+    elif suffix == ".stl" and b"facet" in content[:1024] and b"\0" not in content[:1024]:
+        check_ascii_stl(_text(content, name), name)
+    return content, {}
+
+
+def _scene_parts(trimesh: ModuleType, scene: Any) -> Iterator[MeshPart | None]:
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+            continue
+        mesh = _converted(geometry)
+        if not np.array_equal(matrix, np.eye(4)):
+            mesh = transform(mesh, matrix)
+        yield MeshPart(name, mesh, **_material(getattr(geometry.visual, "material", None)))
+
+
+def _converted(geometry: Any) -> Mesh:
+    normals, uvs = None, getattr(geometry.visual, "uv", None)
+    # `vertex_normals` would be computed where the file has none; its cache tells.
+    if "vertex_normals" in geometry._cache:
+        normals = normalize(np.array(geometry.vertex_normals))
+    return Mesh(
+        vertices=np.array(geometry.vertices),
+        faces=np.array(geometry.faces),
+        normals=normals,
+        uvs=None if uvs is None else np.array(uvs)[:, :2],
+    )
+
+
+def _material(material: Any) -> dict[str, Any]:
+    """Fields of a `MeshPart` from trimesh's material."""
+    numbers = getattr(material, "kwargs", {})
+    fields: dict[str, Any] = {
+        field: np.array(numbers[key], dtype=np.float32)
+        for field, key in (("ambient", "ka"), ("diffuse", "kd"), ("specular", "ks"))
+        if np.shape(numbers.get(key)) == (3,)
+    }
+    if "ns" in numbers:
+        fields["shininess"] = float(numbers["ns"])
+    base = getattr(material, "baseColorFactor", None)
+    if base is not None:
+        base = np.asarray(base)
+        scale = 255 if base.dtype == np.uint8 else 1
+        fields["diffuse"] = (base[:3] / scale).astype(np.float32)
+    picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    if picture is not None:
+        fields["texture"] = _linear_picture(picture)
+    return fields
+
+
+def _linear_picture(picture: Any) -> np.ndarray:
+    has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+    values = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
+    color = np.asarray(srgb_to_linear(values[..., :3]))
+    return np.concatenate([color, values[..., 3:]], axis=2)
+
+
+def _merged(meshes: list[Mesh]) -> Mesh:
+    if len(meshes) == 1:
+        return meshes[0]
+    if any(mesh.normals is not None for mesh in meshes):
+        meshes = [mesh if mesh.normals is not None else with_normals(mesh) for mesh in meshes]
+    if any(mesh.uvs is not None for mesh in meshes):
+        meshes = [mesh if mesh.uvs is not None else _with_zero_uvs(mesh) for mesh in meshes]
+    return merge(meshes)
+
+
+def _with_zero_uvs(mesh: Mesh) -> Mesh:
+    uvs = jnp.zeros_like(mesh.vertices[:, :2])
+    return Mesh(vertices=mesh.vertices, faces=mesh.faces, normals=mesh.normals, uvs=uvs)
+
+
+# --------------------------------------------------------------------------------------- writing
+
+
+def _obj_text(mesh: Mesh) -> str:
+    lines = _rows("v ", mesh.vertices)
+    corner = "{0}"
+    if mesh.uvs is not None:
+        lines += _rows("vt ", mesh.uvs)
+        corner = "{0}/{0}"
+    if mesh.normals is not None:
+        lines += _rows("vn ", mesh.normals)
+        corner = "{0}/{0}/{0}" if mesh.uvs is not None else "{0}//{0}"
+    for face in (np.asarray(mesh.faces) + 1).tolist():
+        lines.append("f " + " ".join(corner.format(index) for index in face))
+    return "\n".join([*lines, ""])
+
+
+def _off_text(mesh: Mesh) -> str:
+    faces = [f"3 {a} {b} {c}" for a, b, c in np.asarray(mesh.faces).tolist()]
+    sizes = f"{mesh.vertices.shape[0]} {len(faces)} 0"
+    return "\n".join(["OFF", sizes, *_rows("", mesh.vertices), *faces, ""])
+
+
+def _rows(start: str, values: Any) -> list[str]:
+    """One line for each row, with the digits that its type needs."""
+    array = np.asarray(values)
+    digits = 17 if array.dtype == np.float64 else 9
+    return [start + " ".join(f"{x:.{digits}g}" for x in row) for row in array.tolist()]
+
+
+def _exported(trimesh: ModuleType, mesh: Mesh, suffix: str) -> bytes:
+    visual = None
+    if mesh.uvs is not None:
+        visual = trimesh.visual.TextureVisuals(uv=np.asarray(mesh.uvs))
+    geometry = trimesh.Trimesh(
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+        vertex_normals=None if mesh.normals is None else np.asarray(mesh.normals),
+        visual=visual,
+        process=False,
+    )
+    has_normals = mesh.normals is not None
+    if suffix == ".ply":
+        return bytes(geometry.export(file_type="ply", vertex_normal=has_normals))
+    if suffix == ".stl":
+        return bytes(geometry.export(file_type="stl"))
+    if suffix == ".glb":
+        return bytes(geometry.export(file_type="glb", include_normals=has_normals))
+    files = geometry.export(
+        file_type="gltf", include_normals=has_normals, merge_buffers=True, embed_buffers=True
+    )
+    return bytes(files["model.gltf"])
+
+
+# --------------------------------------------------------------------------------------- helpers
+
+
+def _known_suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: wanted a suffix among {', '.join(SUFFIXES)}, got {suffix!r}")
+    return suffix
+
+
+def _text(content: bytes, name: str) -> str:
+    if b"\0" in content:
+        line = content[: content.index(b"\0")].count(b"\n") + 1
+        raise ValueError(f"{name}:{line}: wanted text, got binary data")
+    return content.decode("latin-1")  # comments and names may be in any encoding
+
+
+@contextmanager
+def _quiet_trimesh() -> Iterator[ModuleType]:
+    """Import trimesh, and keep it from logging and warning.
+
+    One warning is an error instead: that numbers end in something that is not one.
+    """
+    logger = logging.getLogger("trimesh")
+    was_disabled = logger.disabled
+    logger.disabled = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", message="string or file could not be read to its end")
+            try:
+                import trimesh
+            except ImportError as error:
+                raise ImportError(
+                    "reading and writing mesh files needs trimesh: pip install diffrast[mesh]"
+                ) from error
+            yield trimesh
+    finally:
+        logger.disabled = was_disabled

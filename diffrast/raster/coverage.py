@@ -1,0 +1,262 @@
+"""Coverage and depth: faces drawn one after another into a depth buffer.
+
+On a CPU a loop over faces that each touch a few dozen neighbouring pixels beats every scheme that
+sorts faces into tiles: a block of pixels stays in the first cache level, nothing is binned, and no
+work list has a capacity. The loops are `lax` loops, compiled, over vectorised blocks:
+
+* faces of up to 24×32 pixels: one block each, of the smallest size in `BLOCKS` that holds it;
+* large faces: rows of blocks, each row only as wide as the edges leave it;
+* wide faces (see `fixed_point`): the same sweep with edges from homogeneous coordinates, and the
+  near and far plane tested at every pixel.
+
+Each pixel holds its depth key and face id as the two parts of one complex number, so that one store
+updates both; the id is kept as the bits of a normal float.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+from diffrast.raster.edge_functions import (
+    Corner,
+    Image,
+    Sweep,
+    bias,
+    corners_of,
+    each_edge,
+    edge_value,
+    evaluate,
+    set_up_large,
+    set_up_wide,
+    triangle_slopes,
+)
+from diffrast.raster.fixed_point import (
+    BLOCKS,
+    LARGE,
+    WIDE,
+    Vertices,
+    classify_faces,
+    first_centre,
+    group_by_class,
+    maximum3,
+    minimum3,
+    pixel_range,
+    snap_vertices,
+    subpixel_bits,
+)
+
+SWEEP_BLOCK = (32, 32)
+SWEEP_CHUNK = 128
+_MARGIN = tuple(max(sizes) for sizes in zip(SWEEP_BLOCK, *BLOCKS, strict=True))
+
+
+def visible_faces(
+    positions_clip: Float[Array, "V 4"],
+    faces: Int[Array, "F 3"],
+    *,
+    height: int,
+    width: int,
+    cull_backfaces: bool,
+) -> Int[Array, "height width"]:
+    """Id of the nearest face at every pixel centre, -1 where there is none.
+
+    Not differentiable: pass stopped gradients. Under `vmap` the views are drawn one after another.
+    """
+
+    @jax.custom_batching.sequential_vmap
+    def draw(positions_clip: Array, faces: Array) -> Array:
+        vertices = snap_vertices(positions_clip, height=height, width=width)
+        classes = classify_faces(
+            vertices, faces, height=height, width=width, cull_backfaces=cull_backfaces
+        )
+        order, starts = group_by_class(classes)
+        image = Image(height, width, subpixel_bits(height, width))
+        buffer = _empty_buffer(image, positions_clip.dtype)
+        for size, block in enumerate(BLOCKS):
+            buffer = _draw_blocks(
+                buffer, vertices, faces, order, (starts[size], starts[size + 1]), block, image
+            )
+        wide = partial(set_up_wide, cull_backfaces=cull_backfaces)
+        for size, set_up in ((LARGE, set_up_large), (WIDE, wide)):
+            buffer = _draw_sweeps(
+                buffer, vertices, faces, order, (starts[size], starts[size + 1]), image, set_up
+            )
+        return _face_ids(buffer)[:height, :width]
+
+    return draw(positions_clip, faces)
+
+
+# The depth buffer ---------------------------------------------------------------------------------
+
+
+def _empty_buffer(image: Image, dtype: jnp.dtype) -> Array:
+    # Blocks begin inside the image and may reach beyond it.
+    shape = (image.height + _MARGIN[0], image.width + _MARGIN[1])
+    return lax.complex(jnp.full(shape, -jnp.inf, dtype), _id_as_float(jnp.full(shape, -1), dtype))
+
+
+def _id_as_float(face: Array, dtype: jnp.dtype) -> Array:
+    integer = jnp.int32 if dtype == jnp.float32 else jnp.int64
+    one = lax.bitcast_convert_type(jnp.ones((), dtype), integer)
+    return lax.bitcast_convert_type(face.astype(integer) + one, dtype)
+
+
+def _face_ids(buffer: Array) -> Array:
+    bits = lax.bitcast_convert_type(
+        buffer.imag, jnp.int32 if buffer.dtype == jnp.complex64 else jnp.int64
+    )
+    one = lax.bitcast_convert_type(jnp.ones((), buffer.real.dtype), bits.dtype)
+    return (bits - one).astype(jnp.int32)
+
+
+def _resolve(
+    buffer: Array, corner: tuple[Array, Array], inside: Array, key: Array, face: Array
+) -> Array:
+    """Keep, at each pixel of a block, the larger key; the first drawn of equal ones."""
+    old = lax.dynamic_slice(buffer, corner, inside.shape)
+    tag = jnp.broadcast_to(_id_as_float(face, key.dtype), key.shape)
+    new = jnp.where(inside & (key > old.real), lax.complex(key, tag), old)
+    return lax.dynamic_update_slice(buffer, new, corner)
+
+
+def _pixel_grid(block: tuple[int, int]) -> tuple[Array, Array]:
+    rows = jnp.arange(block[0], dtype=jnp.int32)[:, None]
+    columns = jnp.arange(block[1], dtype=jnp.int32)[None, :]
+    return columns, rows
+
+
+# Faces that fit one block -------------------------------------------------------------------------
+
+
+def _draw_blocks(
+    buffer: Array,
+    vertices: Vertices,
+    faces: Array,
+    order: Array,
+    span: tuple[Array, Array],
+    block: tuple[int, int],
+    image: Image,
+) -> Array:
+    """Draw faces whose pixels fit one block."""
+    bits = image.bits
+    columns, rows = _pixel_grid(block)
+    inverse_w = 1 / jnp.where(vertices.w > 0, vertices.w, 1)
+    x_pixel, y_pixel = vertices.x * inverse_w, vertices.y * inverse_w
+    keys = vertices.rank * inverse_w
+
+    def draw(i: Array, buffer: Array) -> Array:
+        face = order[i]
+        corners = [faces[face, j] for j in range(3)]
+        x_fixed = [vertices.x_fixed[c] for c in corners]
+        y_fixed = [vertices.y_fixed[c] for c in corners]
+        column, _ = pixel_range(minimum3(x_fixed), x_fixed[0], size=image.width, bits=bits)
+        row, _ = pixel_range(minimum3(y_fixed), y_fixed[0], size=image.height, bits=bits)
+        x_origin = (column << bits) + first_centre(image.width, bits)
+        y_origin = (row << bits) + first_centre(image.height, bits)
+
+        twice_area = (x_fixed[1] - x_fixed[0]) * (y_fixed[2] - y_fixed[0]) - (
+            x_fixed[2] - x_fixed[0]
+        ) * (y_fixed[1] - y_fixed[0])
+        sign = jnp.where(twice_area > 0, 1, -1)
+        outside = jnp.zeros((), jnp.int32)
+        for j in range(3):
+            start, end = (j + 1) % 3, (j + 2) % 3
+            a = (y_fixed[start] - y_fixed[end]) * sign
+            b = (x_fixed[end] - x_fixed[start]) * sign
+            value = a * (x_origin - x_fixed[start]) + b * (y_origin - y_fixed[start])
+            value = (value - bias(a, b)) >> bits
+            outside = outside | (value + a * columns + b * rows)  # the sign bit of any edge
+
+        x = [x_pixel[c] for c in corners]
+        y = [y_pixel[c] for c in corners]
+        values = [keys[c] for c in corners]
+        dx, dy = triangle_slopes(x, y, values)
+        x_offset = column.astype(x[0].dtype) + (1 - image.width) / 2 - x[0]
+        y_offset = row.astype(x[0].dtype) + (1 - image.height) / 2 - y[0]
+        key = (values[0] + dx * x_offset + dy * y_offset) + dx * columns + dy * rows
+        key = jnp.clip(key, minimum3(values), maximum3(values))
+        return _resolve(buffer, (row, column), outside >= 0, key, face)
+
+    return lax.fori_loop(*span, draw, buffer)
+
+
+# Large and wide faces -----------------------------------------------------------------------------
+
+
+def _draw_sweeps(
+    buffer: Array,
+    vertices: Vertices,
+    faces: Array,
+    order: Array,
+    span: tuple[Array, Array],
+    image: Image,
+    set_up: Callable[[list[Corner], Image], Sweep],
+) -> Array:
+    """Draw faces of any size: rows of blocks, each as wide as the edges leave it.
+
+    Faces are set up a chunk at a time, vectorised; one flat loop then draws the chunk's blocks. Its
+    state is the face and the block's row and column, where -1 stands for the first.
+    """
+    block_height, block_width = SWEEP_BLOCK
+    columns, rows = _pixel_grid(SWEEP_BLOCK)
+    first, stop = span
+
+    def draw_chunk(n: Array, buffer: Array) -> Array:
+        start = first + n * SWEEP_CHUNK
+        slots = jnp.minimum(start + jnp.arange(SWEEP_CHUNK), order.shape[0] - 1)
+        chunk = order[slots]
+        sweeps = set_up(corners_of(vertices, faces, chunk), image)
+
+        def draw(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            i, row, column, buffer = state
+            sweep = jax.tree.map(lambda values: values[..., i], sweeps)
+            row = jnp.where(row < 0, sweep.rows[0], row)
+            left, right = _row_extent(sweep, row)
+            column = jnp.where(column < 0, left, column)
+
+            outside = jnp.zeros((), jnp.int32)
+            for edge in each_edge(sweep.edges):
+                value = edge_value(edge, column, row)
+                outside = outside | (value + edge.a * columns + edge.b * rows)
+            inside = outside >= 0
+            key = jnp.clip(evaluate(sweep.key, column, row, columns, rows), *sweep.key_range)
+            for plane in sweep.limits:
+                inside = inside & (evaluate(plane, column, row, columns, rows) >= 0)
+            buffer = _resolve(buffer, (row, column), inside, key, chunk[i])
+
+            more_columns = column + block_width <= right
+            more_rows = row + block_height <= sweep.rows[1]
+            return (
+                jnp.where(more_columns | more_rows, i, i + 1),
+                jnp.where(more_columns, row, jnp.where(more_rows, row + block_height, -1)),
+                jnp.where(more_columns, column + block_width, -1),
+                buffer,
+            )
+
+        unset = jnp.full((), -1, jnp.int32)
+        state = (jnp.zeros((), jnp.int32), unset, unset, buffer)
+        count = jnp.minimum(stop - start, SWEEP_CHUNK)
+        return lax.while_loop(lambda s: s[0] < count, draw, state)[3]
+
+    return lax.fori_loop(0, (stop - first + SWEEP_CHUNK - 1) // SWEEP_CHUNK, draw_chunk, buffer)
+
+
+def _row_extent(sweep: Sweep, row: Array) -> tuple[Array, Array]:
+    """First and last column that the edges may leave inside a row of blocks."""
+    dtype = sweep.edges.anchor_x.dtype
+    first, last = sweep.columns[0].astype(dtype), sweep.columns[1].astype(dtype)
+    left, right = first, last
+    for edge in each_edge(sweep.edges):
+        a, b = edge.a.astype(dtype), edge.b.astype(dtype)
+        # Where the edge crosses zero in its best row of the band, with a pixel of slack.
+        y = row.astype(dtype) + jnp.where(b > 0, SWEEP_BLOCK[0] - 1, 0) - edge.anchor_y
+        crossing = edge.anchor_x + edge.run * y
+        left = jnp.maximum(left, jnp.where(a > 0, crossing - 1, first))
+        right = jnp.minimum(right, jnp.where(a < 0, crossing + 1, last))
+    left = jnp.clip(jnp.floor(left), first, last).astype(jnp.int32)
+    right = jnp.clip(jnp.ceil(right), first, last).astype(jnp.int32)
+    return left, right

@@ -1,0 +1,320 @@
+"""Edge functions and depth planes of faces.
+
+Edge functions. With snapped end points a, b and pixel centre p in grid steps, E(p) = A (p.x - a.x)
++ B (p.y - a.y), A = a.y - b.y, B = b.x - a.x, is positive inside. Centres are whole pixels apart,
+so `floor((E - bias) / steps)` changes by exactly A and B from pixel to pixel, and its sign is that
+of E - bias; bias is 0 on top and left edges and 1 on others, which gives a centre on a shared edge
+to one owner. Where int32 might overflow, float32 knows the sign and the value saturates.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrast._compensated import difference_of_products
+from diffrast.raster.fixed_point import (
+    GUARD_BITS,
+    IRREGULAR,
+    Vertices,
+    first_centre,
+    maximum3,
+    minimum3,
+    pixel_range,
+    twice_area_sign,
+)
+
+# |A columns + B rows| over a block of 32×32 pixels, with |A|, |B| <= 2**23, stays below this, and
+# this plus that stays below 2**31: a saturated edge value keeps its sign all over the block.
+_SATURATED = 1 << 29
+
+
+class Image(NamedTuple):
+    """Static sizes: pixels, and log2 of the grid steps a pixel."""
+
+    height: int
+    width: int
+    bits: int
+
+
+class Corner(NamedTuple):
+    """One row of `Vertices`."""
+
+    x_fixed: Array
+    y_fixed: Array
+    x: Array
+    y: Array
+    z: Array
+    w: Array
+    rank: Array
+    outcode: Array
+
+
+def corners_of(vertices: Vertices, faces: Array, face: Array) -> list[Corner]:
+    """Gather the three corners of one face, or of an array of faces."""
+    return [Corner(*(column[faces[face, j]] for column in vertices)) for j in range(3)]
+
+
+def _edge_ends(corners: list[Corner]) -> tuple[Corner, Corner]:
+    """Start and end of the edge opposite to each corner, on a new first axis."""
+
+    def stacked(order: tuple[int, int, int]) -> Corner:
+        columns = zip(*(corners[j] for j in order), strict=True)
+        return Corner(*(jnp.stack(column) for column in columns))
+
+    return stacked((1, 2, 0)), stacked((2, 0, 1))
+
+
+class Edge(NamedTuple):
+    """Edges, the three of a face along the first axis: A column + B row + K at a pixel."""
+
+    a: Array
+    b: Array
+    k: Array  # wraps in int32
+    anchor_x: Array  # a point on the edge, in pixel indices
+    anchor_y: Array
+    run: Array  # columns to the right that make up for one row down: -B / A, or 0
+
+
+class Plane(NamedTuple):
+    """A function affine over the image: value + dx (column - x) + dy (row - y)."""
+
+    value: Array
+    dx: Array
+    dy: Array
+    x: Array
+    y: Array
+
+
+class Sweep(NamedTuple):
+    """Faces of any size, ready to be drawn; every member is a column, or one entry of it."""
+
+    edges: Edge
+    key: Plane
+    key_range: tuple[Array, Array]
+    limits: tuple[Plane, ...]  # not negative where the face is between near and far
+    columns: tuple[Array, Array]  # first and last
+    rows: tuple[Array, Array]
+
+
+def _anchored_edge(x: Array, y: Array, a: Array, b: Array, sign: Array, image: Image) -> Edge:
+    """Edge through a fixed-point anchor (x, y) with the integer normal (a, b) times `sign`.
+
+    With the anchor split into whole pixels and a rest of at most one, E / steps is the sum of an
+    integer product, which may wrap, and of a rest that is small enough to be computed exactly.
+    """
+    bits, steps = image.bits, 1 << image.bits
+    a, b = a * sign, b * sign
+    x, y = x - first_centre(image.width, bits), y - first_centre(image.height, bits)
+    whole_x, whole_y = x >> bits, y >> bits
+    rest_x, rest_y = x - (whole_x << bits), y - (whole_y << bits)
+    a_high, b_high = a >> bits, b >> bits
+    a_low, b_low = a - (a_high << bits), b - (b_high << bits)
+    low = (-a_low * rest_x - b_low * rest_y - bias(a, b)) >> bits
+    k = low - a_high * rest_x - b_high * rest_y - a * whole_x - b * whole_y
+    run = -b / jnp.where(a == 0, 1, a)
+    return Edge(a, b, k, x / steps, y / steps, run)
+
+
+def set_up_large(corners: list[Corner], image: Image) -> Sweep:
+    """Regular vertices: exact edges, key affine on the screen."""
+    x_fixed, y_fixed = [c.x_fixed for c in corners], [c.y_fixed for c in corners]
+    sign = twice_area_sign(x_fixed, y_fixed)
+    start, end = _edge_ends(corners)
+    edges = _anchored_edge(
+        start.x_fixed,
+        start.y_fixed,
+        start.y_fixed - end.y_fixed,
+        end.x_fixed - start.x_fixed,
+        sign,
+        image,
+    )
+    inverse_w = [1 / c.w for c in corners]
+    x = [c.x * i for c, i in zip(corners, inverse_w, strict=True)]
+    y = [c.y * i for c, i in zip(corners, inverse_w, strict=True)]
+    values = [c.rank * i for c, i in zip(corners, inverse_w, strict=True)]
+    dx, dy = triangle_slopes(x, y, values)
+    return Sweep(
+        edges,
+        Plane(values[0], dx, dy, x[0] - (1 - image.width) / 2, y[0] - (1 - image.height) / 2),
+        (minimum3(values), maximum3(values)),
+        (),
+        pixel_range(minimum3(x_fixed), maximum3(x_fixed), size=image.width, bits=image.bits),
+        pixel_range(minimum3(y_fixed), maximum3(y_fixed), size=image.height, bits=image.bits),
+    )
+
+
+def set_up_wide(corners: list[Corner], image: Image, *, cull_backfaces: bool) -> Sweep:
+    """Any vertices: edges as lines of homogeneous coordinates, near and far per pixel.
+
+    e_i(p) = p · (v_j × v_k) is proportional to the barycentric coordinate i times 1/w, and an
+    attribute u with corner values u_i has u / w = Σ e_i(p) u_i / det on the face (Olano and Greer,
+    "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
+    the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
+    """
+    scale = maximum3([_largest([c.x, c.y, c.w]) for c in corners])
+    inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
+    points = [[v * inverse_scale for v in (c.x, c.y, c.w)] for c in corners]
+    normal = _cross(_minus(points[1], points[0]), _minus(points[2], points[0]))
+    determinant = sum(p * n for p, n in zip(points[0], normal, strict=True))
+    orientation = jnp.sign(determinant)
+
+    def plane(values: list[Array], factor: Array) -> Plane:
+        """`factor` times the numerator Σ e_i values_i, anchored at the image centre."""
+        second, third = _cross(points[2], points[0]), _cross(points[0], points[1])
+        vector = [
+            (values[0] * n + (values[1] - values[0]) * s + (values[2] - values[0]) * t) * factor
+            for n, s, t in zip(normal, second, third, strict=True)
+        ]
+        centre_x, centre_y = (jnp.full_like(scale, (n - 1) / 2) for n in image[1::-1])
+        return Plane(vector[2], vector[0], vector[1], centre_x, centre_y)
+
+    size = jnp.abs(determinant) * scale
+    inverse_size = jnp.where(size > 0, orientation / jnp.where(size > 0, size, 1), 0)
+    in_front = [c.w > 0 for c in corners]
+    ratios = [c.rank / jnp.where(f, c.w, 1) for c, f in zip(corners, in_front, strict=True)]
+    bounded = in_front[0] & in_front[1] & in_front[2]
+    infinite = jnp.asarray(jnp.inf, scale.dtype)
+    depths = [c.z * inverse_scale for c in corners]
+    # y points down: a front face, counter-clockwise to the viewer, has a negative determinant.
+    # With a sign of zero the edges leave nothing inside.
+    drawn = (orientation < 0) if cull_backfaces else (orientation != 0)
+    sign = jnp.where(drawn, orientation, 0).astype(jnp.int32)
+    return Sweep(
+        _homogeneous_edge(*_edge_ends(corners), sign, image),
+        plane([c.rank for c in corners], inverse_size),
+        (
+            jnp.where(bounded, minimum3(ratios), -infinite),
+            jnp.where(bounded, maximum3(ratios), infinite),
+        ),
+        (
+            plane([p[2] + d for p, d in zip(points, depths, strict=True)], orientation),
+            plane([p[2] - d for p, d in zip(points, depths, strict=True)], orientation),
+        ),
+        (jnp.zeros_like(sign), jnp.full_like(sign, image.width - 1)),
+        (jnp.zeros_like(sign), jnp.where(drawn, image.height - 1, 0)),
+    )
+
+
+def _homogeneous_edge(start: Corner, end: Corner, sign: Array, image: Image) -> Edge:
+    """Integer edge of a wide face; it depends on its two end points alone.
+
+    Between regular ends the edge is that of every other face. With one regular end it passes
+    exactly through the snapped end, so that a fan round a vertex in view has no gaps, towards the
+    other. Between two ends that are not regular it is their line, anchored where it comes nearest
+    to the image centre, or without a zero in the image if that is outside the guard band.
+    """
+    start_regular, end_regular = ((c.outcode & IRREGULAR) == 0 for c in (start, end))
+    one, both = start_regular != end_regular, start_regular & end_regular
+
+    # One regular end: direction towards the other, as the regular end sees it.
+    near = Corner(*(jnp.where(start_regular, s, e) for s, e in zip(start, end, strict=True)))
+    far = Corner(*(jnp.where(start_regular, e, s) for s, e in zip(start, end, strict=True)))
+    inverse_w = 1 / jnp.where(one | both, near.w, 1)
+    other = _unit_point(far)
+    turn = jnp.where(start_regular, 1, -1)
+    toward_x = (other[0] - near.x * inverse_w * other[2]) * turn
+    toward_y = (other[1] - near.y * inverse_w * other[2]) * turn
+
+    # No regular end: the line through both, computed from the same operands by both owners.
+    first, second = _unit_point(start), _unit_point(end)
+    swap = _sorts_after(first, second)
+    first, second = (
+        [jnp.where(swap, s, f) for f, s in zip(first, second, strict=True)],
+        [jnp.where(swap, f, s) for f, s in zip(first, second, strict=True)],
+    )
+    line = [jnp.where(swap, -component, component) for component in _cross(first, second)]
+    square = line[0] * line[0] + line[1] * line[1]
+    foot = -line[2] / jnp.where(square > 0, square, 1)
+    foot_x, foot_y = line[0] * foot, line[1] * foot
+    limit = float(1 << (GUARD_BITS - image.bits))
+    crosses = (square > 0) & (jnp.maximum(jnp.abs(foot_x), jnp.abs(foot_y)) <= limit)
+
+    normal_x = jnp.where(one, -toward_y, jnp.where(crosses, line[0], 0))
+    normal_y = jnp.where(one, toward_x, jnp.where(crosses, line[1], 0))
+    length = jnp.maximum(jnp.abs(normal_x), jnp.abs(normal_y))
+    unit = float(1 << GUARD_BITS) / jnp.where(length > 0, length, 1)
+
+    def integer(values: Array) -> Array:
+        return jnp.round(values).astype(jnp.int32)
+
+    def fixed(regular: Array, foot: Array) -> Array:
+        return jnp.where(
+            one | both, regular, integer(jnp.where(crosses, foot, 0) * (1 << image.bits))
+        )
+
+    edge = _anchored_edge(
+        fixed(near.x_fixed, foot_x),
+        fixed(near.y_fixed, foot_y),
+        jnp.where(both, start.y_fixed - end.y_fixed, integer(normal_x * unit)),
+        jnp.where(both, end.x_fixed - start.x_fixed, integer(normal_y * unit)),
+        sign,
+        image,
+    )
+    constant = jnp.where(line[2] * sign > 0, _SATURATED, -_SATURATED)
+    return edge._replace(k=jnp.where(one | both | crosses, edge.k, constant))
+
+
+def _unit_point(corner: Corner) -> list[Array]:
+    """Homogeneous pixel coordinates, scaled by their largest."""
+    size = _largest([corner.x, corner.y, corner.w])
+    inverse = 1 / jnp.where(size > 0, size, 1)
+    return [corner.x * inverse, corner.y * inverse, corner.w * inverse]
+
+
+def _largest(values: list[Array]) -> Array:
+    return maximum3([jnp.abs(v) for v in values])
+
+
+def _minus(a: list[Array], b: list[Array]) -> list[Array]:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _cross(a: list[Array], b: list[Array]) -> list[Array]:
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return [difference_of_products(a[i], b[j], a[j], b[i]) for i, j in pairs]
+
+
+def _sorts_after(a: list[Array], b: list[Array]) -> Array:
+    """Whether `a` comes after `b` in lexicographic order."""
+    return (a[0] > b[0]) | ((a[0] == b[0]) & ((a[1] > b[1]) | ((a[1] == b[1]) & (a[2] > b[2]))))
+
+
+def bias(a: Array, b: Array) -> Array:
+    """0 for a top or left edge, which owns the centres on it, and 1 for the others."""
+    return jnp.where((a > 0) | ((a == 0) & (b > 0)), 0, 1)
+
+
+def triangle_slopes(x: list[Array], y: list[Array], values: list[Array]) -> tuple[Array, Array]:
+    """Slopes along columns and rows of the affine function with these corner values.
+
+    The result is clamped to the corner values by its user, so a sliver's wild slopes do no harm.
+    """
+    x1, y1, x2, y2 = x[1] - x[0], y[1] - y[0], x[2] - x[0], y[2] - y[0]
+    v1, v2 = values[1] - values[0], values[2] - values[0]
+    twice_area = x1 * y2 - x2 * y1
+    scale = jnp.where(twice_area == 0, 0, 1 / jnp.where(twice_area == 0, 1, twice_area))
+    return (v1 * y2 - v2 * y1) * scale, (v2 * x1 - v1 * x2) * scale
+
+
+def evaluate(plane: Plane, column: Array, row: Array, columns: Array, rows: Array) -> Array:
+    """Value at each pixel of the block that begins at (column, row)."""
+    dtype = plane.value.dtype
+    x, y = column.astype(dtype) - plane.x, row.astype(dtype) - plane.y
+    return (plane.value + plane.dx * x + plane.dy * y) + plane.dx * columns + plane.dy * rows
+
+
+def each_edge(edges: Edge) -> list[Edge]:
+    """Split edges along their first axis."""
+    return [Edge(*(column[j] for column in edges)) for j in range(3)]
+
+
+def edge_value(edge: Edge, column: Array, row: Array) -> Array:
+    """Exact edge value at a pixel, saturated where it is far from zero."""
+    dtype = edge.anchor_x.dtype
+    wrapped = edge.a * column + edge.b * row + edge.k
+    rounded = edge.a.astype(dtype) * (column.astype(dtype) - edge.anchor_x) + edge.b.astype(
+        dtype
+    ) * (row.astype(dtype) - edge.anchor_y)
+    far = jnp.where(rounded > 0, _SATURATED, -_SATURATED)
+    return jnp.where(jnp.abs(rounded) < _SATURATED, wrapped, far)

@@ -1,0 +1,82 @@
+"""The Platonic solids (FEATURES G1; Van Houdt 8), centred at the origin.
+
+Sizes are the source's where it has round numbers: cube and tetrahedron have corners at (±1, ±1,
+±1), the tetrahedron four of the cube's eight; octahedron, icosahedron and dodecahedron have their
+corners on the unit sphere.
+
+Every solid comes in two forms. By default faces share their vertices (a cube has 8) and there are
+no normals: what is drawn is the flat faces, and the vertices can be moved, counted and copied.
+With `flat=True` each triangle has its own corners with the face's normal, for code that wants
+normals at vertices. Both have the same silhouettes. Faces are counter-clockwise from outside.
+"""
+
+import numpy as np
+
+from diffrast.mesh import Mesh, flat_shaded
+
+
+def cube(*, flat: bool = False) -> Mesh:
+    """Cube with corners (±1, ±1, ±1): edges of length 2, 12 triangles."""
+    corners = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    squares = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return _solid(np.array(corners), np.array(squares), flat)
+
+
+def tetrahedron(*, flat: bool = False) -> Mesh:
+    """Tetrahedron on four corners of the cube: edges of length 2√2."""
+    corners = [[1, -1, -1], [-1, 1, -1], [1, 1, 1], [-1, -1, 1]]
+    return _solid(np.array(corners), np.array([[0, 1, 2], [1, 3, 2], [0, 2, 3], [0, 3, 1]]), flat)
+
+
+def octahedron(*, flat: bool = False) -> Mesh:
+    """Octahedron with corners ±1 on the axes: edges of length √2."""
+    corners = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1], [0, 0, 1]]
+    side = np.arange(4)
+    following = (side + 1) % 4
+    upper = np.stack([side, following, np.full(4, 5)], axis=1)
+    lower = np.stack([following, side, np.full(4, 4)], axis=1)
+    return _solid(np.array(corners), np.concatenate([upper, lower]), flat)
+
+
+def icosahedron(*, flat: bool = False) -> Mesh:
+    """Icosahedron in the unit sphere, two corners on the z axis: 20 faces."""
+    return _solid(*icosahedron_arrays(), flat)
+
+
+def dodecahedron(*, flat: bool = False) -> Mesh:
+    """Dodecahedron in the unit sphere, the dual of `icosahedron`: 12 pentagons, 36 triangles."""
+    corners, triangles = icosahedron_arrays()
+    centres = corners[triangles].sum(axis=1)
+    # One pentagon round each corner of the icosahedron; its faces come in four rings of five.
+    top, above, below, bottom = np.arange(20).reshape(4, 5)
+    upper = [top, np.roll(top, 1), np.roll(above, 1), np.roll(below, 1), above]
+    lower = [above, np.roll(below, 1), np.roll(bottom, 1), bottom, below]
+    rings = [top[None], np.stack(upper, axis=1), np.stack(lower, axis=1), bottom[None, ::-1]]
+    unit = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    return _solid(unit, np.concatenate(rings), flat)
+
+
+def icosahedron_arrays() -> tuple[np.ndarray, np.ndarray]:
+    """Corners (12, 3) on the unit sphere and faces (20, 3): pole, ring, ring, pole."""
+    angle = np.arange(10) * np.pi / 5
+    ring = np.stack([np.cos(angle), np.sin(angle), np.where(np.arange(10) % 2, -0.5, 0.5)], axis=1)
+    pole = np.array([[0, 0, np.sqrt(5) / 2]])
+    corners = np.concatenate([pole, ring[::2], ring[1::2], -pole]) * 2 / np.sqrt(5)
+    side = np.arange(5)
+    upper, lower = 1 + side, 6 + side
+    upper_next, lower_next = np.roll(upper, -1), np.roll(lower, -1)
+    faces = [
+        [np.full(5, 0), upper, upper_next],
+        [upper, lower, upper_next],
+        [upper_next, lower, lower_next],
+        [np.full(5, 11), lower_next, lower],
+    ]
+    return corners, np.concatenate([np.stack(ring_faces, axis=1) for ring_faces in faces])
+
+
+def _solid(corners: np.ndarray, polygons: np.ndarray, flat: bool) -> Mesh:
+    """Cut equal convex polygons into fans."""
+    sides = range(1, polygons.shape[1] - 1)
+    triangles = np.stack([polygons[:, [0, k, k + 1]] for k in sides], axis=1)
+    mesh = Mesh(vertices=corners, faces=triangles.reshape(-1, 3))
+    return flat_shaded(mesh) if flat else mesh

@@ -1,0 +1,209 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from diffrast import mesh as dm
+from diffrast import shapes
+
+SOLIDS = {  # faces of the solid, corners of a face, corners of the solid, circumradius, volume
+    shapes.tetrahedron: (4, 3, 4, np.sqrt(3), 8 / 3),
+    shapes.cube: (6, 4, 8, np.sqrt(3), 8),
+    shapes.octahedron: (8, 3, 6, 1, 4 / 3),
+    shapes.icosahedron: (20, 3, 12, 1, np.sqrt(40 + 8 * np.sqrt(5)) / 3),
+    shapes.dodecahedron: (12, 5, 20, 1, 2 * (5 + np.sqrt(5)) / np.sqrt(27)),
+}
+CLOSED = {
+    "icosphere": (lambda: shapes.icosphere(2), 2),
+    "uv_sphere": (lambda: shapes.uv_sphere(segments=5, rings=4), 2),
+    "smallest uv_sphere": (lambda: shapes.uv_sphere(segments=3, rings=2), 2),
+    "cylinder": (lambda: shapes.cylinder(segments=7, divisions=3), 2),
+    "cone": (lambda: shapes.cone(segments=7), 2),
+    "torus": (lambda: shapes.torus(major_segments=7, minor_segments=5), 0),
+}
+
+
+def smallest_angle_cosine(mesh):
+    """Between the normals at a face's corners and the face's own; degenerate faces left out."""
+    facets = np.asarray(dm.face_normals(mesh.vertices, mesh.faces))
+    corners = np.asarray(mesh.normals)[np.asarray(mesh.faces)]
+    return np.einsum("fc,fkc->fk", facets, corners)[facets.any(axis=1)].min()
+
+
+# ---------------------------------------------------------------------------------------- solids
+
+
+@pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.__name__)
+def test_solids_are_regular_centred_and_turned_outwards(solid):
+    faces, sides, corners, circumradius, volume = SOLIDS[solid]
+    mesh = solid()
+    vertices = np.asarray(mesh.vertices)
+    assert mesh.normals is None
+    assert vertices.shape == (corners, 3)
+    assert mesh.faces.shape == (faces * (sides - 2), 3)
+    assert dm.euler_characteristic(mesh) == 2
+    assert dm.is_closed(mesh)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), circumradius, rtol=1e-6)
+    np.testing.assert_allclose(vertices.mean(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(dm.signed_volume(mesh), volume, rtol=1e-6)
+    normals = np.asarray(dm.face_normals(vertices, mesh.faces))
+    assert (np.einsum("fc,fc->f", normals, vertices[mesh.faces[:, 0]]) > 0.3).all()
+    # The solid's own edges are those where two planes meet; all are equally long.
+    edges, pairs, _ = dm.edge_adjacency(vertices, mesh.faces)
+    bent = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < 0.999
+    assert bent.sum() == faces * sides // 2
+    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)[bent]
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.__name__)
+def test_flat_solids_have_the_normals_of_their_faces(solid):
+    flat = solid(flat=True)
+    assert flat.vertices.shape == (3 * len(flat.faces), 3)
+    np.testing.assert_allclose(smallest_angle_cosine(flat), 1, rtol=1e-6)
+    assert len(dm.edge_adjacency(flat.vertices, flat.faces).edges) == len(
+        dm.edge_adjacency(solid().vertices, solid().faces).edges
+    )
+
+
+# ---------------------------------------------------------------------------------------- curved
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_surfaces_are_closed_and_have_unit_normals_outwards(name):
+    make, characteristic = CLOSED[name]
+    mesh = make()
+    assert dm.is_closed(mesh)
+    assert dm.euler_characteristic(mesh) == characteristic
+    assert dm.signed_volume(mesh) > 0.5
+    np.testing.assert_allclose(jnp.linalg.norm(mesh.normals, axis=1), 1, rtol=1e-6)
+    assert smallest_angle_cosine(mesh) > 0.4
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+    assert (dm.face_areas(mesh.vertices, mesh.faces) > 0).all()
+    if mesh.uvs is not None:
+        assert mesh.uvs.min() >= 0
+        assert mesh.uvs.max() <= 1
+
+
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_icosphere_has_its_count_of_faces_and_exact_normals(level):
+    mesh = shapes.icosphere(level, 2.5)
+    assert mesh.faces.shape == (20 * 4**level, 3)
+    assert mesh.vertices.shape == (10 * 4**level + 2, 3)
+    np.testing.assert_allclose(mesh.vertices, 2.5 * mesh.normals, rtol=1e-6)
+
+
+def test_finer_surfaces_approach_their_volumes_quadratically():
+    exact = {
+        "icosphere": (lambda n: shapes.icosphere(n), 4 / 3 * np.pi),
+        "uv_sphere": (lambda n: shapes.uv_sphere(segments=2**n * 6, rings=2**n * 3), 4 / 3 * np.pi),
+        "cylinder": (lambda n: shapes.cylinder(0.5, 3.0, segments=2**n * 5), 0.75 * np.pi),
+        "cone": (lambda n: shapes.cone(0.5, 3.0, segments=2**n * 5), 0.25 * np.pi),
+        "torus": (
+            lambda n: shapes.torus(2.0, 0.5, major_segments=2**n * 6, minor_segments=2**n * 3),
+            2 * np.pi**2 * 2 * 0.25,
+        ),
+    }
+    for name, (make, volume) in exact.items():
+        errors = [1 - float(dm.signed_volume(make(n))) / volume for n in (1, 2)]
+        assert 0 < errors[1] < errors[0] < 0.3, name
+        assert 3.5 < errors[0] / errors[1] < 4.6, name
+
+
+def test_normals_of_curved_sides_are_exact():
+    cylinder = shapes.cylinder(2.0, 3.0, segments=8, divisions=2)
+    side = cylinder.normals[:, 2] == 0
+    assert side.sum() == 27
+    np.testing.assert_allclose(
+        cylinder.normals[side], cylinder.vertices[side] * jnp.array([0.5, 0.5, 0]), atol=1e-6
+    )
+    caps = cylinder.vertices[~side]
+    np.testing.assert_array_equal(cylinder.normals[~side][:, 2], jnp.sign(caps[:, 2]))
+    cone = shapes.cone(2.0, 3.0, segments=8)
+    side = cone.normals[:, 2] > 0
+    assert side.sum() == 17
+    np.testing.assert_allclose(cone.normals[side][:, 2], 2 / np.sqrt(13), rtol=1e-6)
+    np.testing.assert_array_equal(cone.normals[~side], np.tile([0, 0, -1], (9, 1)))
+    torus = shapes.torus(2.0, 0.5, major_segments=6, minor_segments=5)
+    middle = torus.vertices - 0.5 * torus.normals
+    np.testing.assert_allclose(jnp.linalg.norm(middle, axis=1), 2, rtol=1e-6)
+    np.testing.assert_allclose(middle[:, 2], 0, atol=1e-6)
+
+
+def test_open_forms_leave_out_the_caps():
+    assert shapes.cylinder(segments=5, caps=False).faces.shape == (10, 3)
+    assert shapes.cone(segments=5, caps=False).faces.shape == (5, 3)
+
+
+def test_plane_faces_up_and_carries_its_texture():
+    mesh = shapes.plane(4.0, 2.0, divisions=(2, 3))
+    assert mesh.faces.shape == (12, 3)
+    np.testing.assert_allclose(dm.face_normals(mesh.vertices, mesh.faces)[:, 2], 1)
+    np.testing.assert_allclose(
+        mesh.vertices[:, :2], (mesh.uvs - 0.5) * jnp.array([4, 2]), atol=1e-6
+    )
+    np.testing.assert_allclose(dm.face_areas(mesh.vertices, mesh.faces).sum(), 8, rtol=1e-6)
+
+
+def test_uvs_run_once_round_the_axis():
+    for mesh in (shapes.uv_sphere(), shapes.cylinder(caps=False), shapes.torus()):
+        angle = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0]) / (2 * np.pi)
+        radius = np.linalg.norm(mesh.vertices[:, :2], axis=1)
+        turns = (np.asarray(mesh.uvs[:, 0]) - angle)[radius > 1e-3]
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
+
+
+def test_height_field_lies_like_an_image():
+    heights = np.random.default_rng(2).normal(size=(3, 5))
+    mesh = shapes.height_field(heights, 4.0, 2.0)
+    assert mesh.faces.shape == (16, 3)
+    np.testing.assert_allclose(mesh.vertices[:, 2], heights.reshape(-1), rtol=1e-6)
+    np.testing.assert_allclose(mesh.vertices[0, :2], [-2, 1])
+    np.testing.assert_allclose(mesh.vertices[-1, :2], [2, -1])
+    np.testing.assert_allclose(mesh.uvs[0], [0, 1])
+    assert (dm.face_normals(mesh.vertices, mesh.faces)[:, 2] > 0).all()
+    assert (mesh.normals[:, 2] > 0).all()
+    x, y = np.meshgrid(np.linspace(-1, 1, 4), np.linspace(1, -1, 4))
+    slope = shapes.height_field(0.5 * x + 0.25 * y).normals
+    want = np.array([-0.5, -0.25, 1])
+    np.testing.assert_allclose(slope, np.tile(want / np.linalg.norm(want), (16, 1)), atol=1e-6)
+
+
+def test_sizes_and_heights_are_differentiable():
+    def leaves(mesh):
+        return mesh.vertices, mesh.normals
+
+    @jax.jit
+    def everything(size, heights):
+        return [
+            leaves(shapes.uv_sphere(size[0], segments=3, rings=3)),
+            leaves(shapes.cone(size[0], size[1], segments=3)),
+            leaves(shapes.torus(size[1], size[0], major_segments=3, minor_segments=3)),
+            leaves(shapes.height_field(heights, size[0], size[1])),
+        ]
+
+    heights = np.random.default_rng(2).normal(size=(3, 3))
+    with jax.enable_x64(True):
+        check_grads(everything, (np.array([0.7, 1.3]), heights), order=1, rtol=1e-5)
+    tiny = shapes.cone(1e-20, 3e-20, segments=5)
+    np.testing.assert_allclose(tiny.normals, shapes.cone(1.0, 3.0, segments=5).normals, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: shapes.icosphere(-1), "subdivisions: wanted an integer of at least 0, got -1"),
+        (lambda: shapes.icosphere(1, 0.0), "radius: wanted a number between 0 and inf, got 0"),
+        (lambda: shapes.uv_sphere(segments=2), "segments: wanted an integer of at least 3"),
+        (lambda: shapes.uv_sphere(rings=1), "rings: wanted an integer of at least 2"),
+        (lambda: shapes.cylinder(height=-1.0), "height: wanted a number between 0"),
+        (lambda: shapes.torus(minor_radius=float("nan")), "minor_radius: wanted finite"),
+        (lambda: shapes.plane(divisions=(1, 0)), "divisions: wanted an integer of at least 1"),
+        (lambda: shapes.height_field(np.zeros((1, 4))), "heights: wanted at least 2 rows"),
+        (lambda: shapes.height_field(np.zeros(4)), r"heights: wanted shape \(rows, columns\)"),
+    ],
+)
+def test_shapes_refuse(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
