@@ -1,3 +1,45 @@
-"""x."""
-from diffrast.raster import rasterize, Fragments
-from diffrast.interpolate import interpolate
+"""Differentiable, vectorised triangle rasteriser.
+
+The way of the data::
+
+    mesh, transforms ──► world positions
+    camera           ──► clip positions            linalg, camera
+                         coverage, 1/z resolve     raster: which face each pixel sees
+                         interpolation             interpolate: attributes of the visible points
+    lights, materials ─► shading                   light, material, shade
+                         image ──► loss ──► fit    render, fit
+
+`render(scene, camera, settings)` runs all of it; each stage can be used alone, with a JAX function
+of one's own in the place of any other.
+"""
+
+from diffrast import color as color
+from diffrast import fit as fit
+from diffrast import linalg as linalg
+from diffrast import mesh as mesh
+from diffrast import shapes as shapes
+from diffrast.camera import Camera as Camera
+from diffrast.camera import clip_to_pixel as clip_to_pixel
+from diffrast.camera import stack_cameras as stack_cameras
+from diffrast.camera import viewpoint as viewpoint
+from diffrast.camera import world_to_clip as world_to_clip
+from diffrast.files import load_bezier as load_bezier
+from diffrast.files import load_image as load_image
+from diffrast.files import load_mesh as load_mesh
+from diffrast.files import save_animation as save_animation
+from diffrast.files import save_image as save_image
+from diffrast.files import save_mesh as save_mesh
+from diffrast.interpolate import interpolate as interpolate
+from diffrast.light import AmbientLight as AmbientLight
+from diffrast.light import DirectionalLight as DirectionalLight
+from diffrast.light import PointLight as PointLight
+from diffrast.material import Material as Material
+from diffrast.mesh import Mesh as Mesh
+from diffrast.raster import Fragments as Fragments
+from diffrast.raster import rasterize as rasterize
+from diffrast.render import Buffers as Buffers
+from diffrast.render import Object as Object
+from diffrast.render import RenderSettings as RenderSettings
+from diffrast.render import Scene as Scene
+from diffrast.render import render as render
+from diffrast.render import render_buffers as render_buffers

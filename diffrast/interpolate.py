@@ -6,6 +6,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from diffrast._check import float_array, index_array
+from diffrast._stored import assemble
 from diffrast.raster import Fragments
 
 
@@ -29,13 +30,15 @@ def interpolate(
     attributes = float_array("attributes", attributes, ("V", "C"), finite=False)
     faces = index_array("faces", faces, ("F", 3), bound=attributes.shape[0])
     barycentrics = [fragments.barycentrics[..., j] for j in range(3)]
+    if attributes.shape[1] == 0:
+        return jnp.zeros((*fragments.face.shape, 0), attributes.dtype)
     columns = interpolate_columns(
         [attributes[:, c] for c in range(attributes.shape[1])],
         faces,
         fragments.face,
         barycentrics,
     )
-    return jnp.stack(columns, -1) if columns else jnp.zeros((*fragments.face.shape, 0))
+    return assemble(columns)
 
 
 def interpolate_columns(

@@ -40,8 +40,8 @@ class Mesh:
     Attributes:
         vertices: positions, any unit of length.
         faces: three vertex ids each, counter-clockwise seen from outside.
-        normals: unit vectors pointing out, or `None`: each face is then shaded as the flat
-            triangle that it is. `with_normals` makes smooth ones.
+        normals: unit vectors pointing out, or `None`; `with_normals` makes smooth ones, and
+            `flat_shaded` those of the faces.
         uvs: texture coordinates, v upwards, or `None`.
 
     Raises:

@@ -37,7 +37,7 @@ def smallest_angle_cosine(mesh):
 @pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.__name__)
 def test_solids_are_regular_centred_and_turned_outwards(solid):
     faces, sides, corners, circumradius, volume = SOLIDS[solid]
-    mesh = solid()
+    mesh = solid(flat=False)
     vertices = np.asarray(mesh.vertices)
     assert mesh.normals is None
     assert vertices.shape == (corners, 3)
@@ -59,12 +59,13 @@ def test_solids_are_regular_centred_and_turned_outwards(solid):
 
 @pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.__name__)
 def test_flat_solids_have_the_normals_of_their_faces(solid):
-    flat = solid(flat=True)
+    flat, joined = solid(), solid(flat=False)
     assert flat.vertices.shape == (3 * len(flat.faces), 3)
     np.testing.assert_allclose(smallest_angle_cosine(flat), 1, rtol=1e-6)
-    assert len(dm.edge_adjacency(flat.vertices, flat.faces).edges) == len(
-        dm.edge_adjacency(solid().vertices, solid().faces).edges
-    )
+    for mesh in (flat, joined):
+        assert dm.is_closed(mesh)
+        assert dm.euler_characteristic(mesh) == 2
+        assert len(dm.edge_adjacency(mesh.vertices, mesh.faces).edges) == 3 * len(mesh.faces) // 2
 
 
 # ---------------------------------------------------------------------------------------- curved

@@ -1,5 +1,11 @@
 """Files in and out: images, meshes, and the thesis's scenes."""
 
+from diffrast.files.bezier import load_bezier as load_bezier
+from diffrast.files.bezier import save_bezier as save_bezier
 from diffrast.files.images import load_image as load_image
 from diffrast.files.images import save_animation as save_animation
 from diffrast.files.images import save_image as save_image
+from diffrast.files.meshes import MeshPart as MeshPart
+from diffrast.files.meshes import load_mesh as load_mesh
+from diffrast.files.meshes import load_mesh_parts as load_mesh_parts
+from diffrast.files.meshes import save_mesh as save_mesh

@@ -5,9 +5,9 @@ first vertex for index 0, accepts OFF and PLY files that end early, and does not
 is broken. Each check here raises `ValueError` "file:line: wanted ..., got ...".
 """
 
+import math
 from collections.abc import Iterator
-
-import numpy as np
+from itertools import pairwise
 
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
 
@@ -32,15 +32,15 @@ def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
         elif keep_materials and key in ("mtllib", "usemtl"):
             faces.append(" ".join(words))
     corners = [corner for face in faces if not isinstance(face, str) for corner in face[1]]
-    used = [all(corner[k] for corner in corners) for k in range(3)]
+    kind = (all(corner[1] for corner in corners), all(corner[2] for corner in corners))
     lines = []
     for face in faces:
         if isinstance(face, str):
             lines.append(face)
             continue
         _obj_in_range(face, counts, name)
-        written = ["/".join(_obj_corner(corner, used)) for corner in face[1]]
-        lines += [f"f {written[0]} {b} {c}" for b, c in zip(written[1:], written[2:], strict=False)]
+        written = [_obj_corner(corner, kind) for corner in face[1]]
+        lines += [f"f {written[0]} {b} {c}" for b, c in pairwise(written[1:])]
     return "\n".join([*vertices, *lines, ""])
 
 
@@ -97,18 +97,20 @@ def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[l
 
 
 def _obj_in_range(face: tuple[int, list[list[int]]], counts: dict[str, int], name: str) -> None:
-    for corner in face[1]:
-        for index, (key, count) in zip(corner, counts.items(), strict=True):
-            if index > count:
+    for k, (key, count) in enumerate(counts.items()):
+        for corner in face[1]:
+            if (index := corner[k]) > count:
                 raise ValueError(
                     f"{name}:{face[0]}: wanted an index of at most {count}, the number of {key} in"
                     f" the file, got {index}"
                 )
 
 
-def _obj_corner(corner: list[int], used: list[bool]) -> list[str]:
-    fields = [str(index) if use else "" for index, use in zip(corner, used, strict=True)]
-    return fields[: 1 + max(k for k in range(3) if used[k])]
+def _obj_corner(corner: list[int], kind: tuple[bool, bool]) -> str:
+    has_uv, has_normal = kind
+    if has_normal:
+        return f"{corner[0]}/{corner[1] if has_uv else ''}/{corner[2]}"
+    return f"{corner[0]}/{corner[1]}" if has_uv else f"{corner[0]}"
 
 
 def check_off(text: str, name: str) -> None:
@@ -140,8 +142,8 @@ def check_ascii_ply(text: str, name: str) -> None:
     """Check that a text PLY file has the elements that its header announces."""
     lines = _numbered(text)
     elements: list[tuple[str, int, list[str]]] = []
-    number = 0
-    for number, words in lines:
+    number = 1
+    for number, words in lines:  # noqa: B007 (where the header ends)
         if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and elements:
@@ -164,7 +166,7 @@ def check_ascii_ply(text: str, name: str) -> None:
 
 def check_ascii_stl(text: str, name: str) -> None:
     """Check that a text STL file has facets of three vertices, and an end."""
-    corners, number = 0, 0
+    corners, number, inside = 0, 1, False
     for number, words in _numbered(text):
         key = words[0].lower() if words else ""
         if key == "vertex":
@@ -173,8 +175,9 @@ def check_ascii_stl(text: str, name: str) -> None:
                 raise ValueError(f"{name}:{number}: wanted three numbers, got {_quote(words[1:])}")
         elif key in ("endloop", "endfacet", "endsolid") and corners % 3:
             raise ValueError(f"{name}:{number}: wanted facets of three vertices, got {key} early")
-        ended = key == "endsolid" if key else number > 1 and ended
-    if not ended:
+        elif key in ("solid", "endsolid"):
+            inside = key == "solid"
+    if inside:
         raise ValueError(f"{name}:{number}: wanted endsolid, got the end of the file")
 
 
@@ -207,7 +210,7 @@ def _check_indices(words: list[str], bound: int, where: str) -> None:
 
 def _is_finite(word: str) -> bool:
     try:
-        return bool(np.isfinite(float(word)))
+        return math.isfinite(float(word))
     except ValueError:
         return False
 

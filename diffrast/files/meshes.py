@@ -6,6 +6,7 @@ checks text formats first.
 """
 
 import io
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -105,14 +106,13 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
         content, options = _checked(content, suffix, path, materials)
         try:
             scene = trimesh.load_scene(
-                io.BytesIO(content),
+                io.BytesIO(_with_gltf_materials(content, suffix)),
                 file_type=suffix[1:],
                 resolver=trimesh.resolvers.FilePathResolver(str(path)),
                 process=False,
-                skip_materials=not materials,
                 **options,
             )
-            parts = [part for part in _scene_parts(trimesh, scene) if part is not None]
+            parts = list(_scene_parts(trimesh, scene))
         # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
         except Exception as error:
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -132,20 +132,43 @@ def _checked(
     if suffix == ".obj":
         text = plain_obj(_text(content, name), name, keep_materials=materials)
         # Keeping the order is right only where there is nothing to split vertices for.
-        return text.encode(), {"maintain_order": "/" not in text.partition("\nf ")[2]}
+        plain = "/" not in text.partition("\nf ")[2]
+        return text.encode(), {"maintain_order": plain, "skip_materials": not materials}
     if suffix == ".off":
         check_off(_text(content, name), name)
     elif suffix == ".ply":
         header = content.partition(b"end_header")[0]
         if b"format ascii" in header:
             check_ascii_ply(_text(content, name), name)
-        return content, {"fix_texture": b"texcoord" in header}
+        return content, {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
     elif suffix == ".stl" and b"facet" in content[:1024] and b"\0" not in content[:1024]:
         check_ascii_stl(_text(content, name), name)
     return content, {}
 
 
-def _scene_parts(trimesh: ModuleType, scene: Any) -> Iterator[MeshPart | None]:
+def _with_gltf_materials(content: bytes, suffix: str) -> bytes:
+    """Give a material to glTF primitives without one: trimesh reads no uvs for those."""
+    if suffix not in (".glb", ".gltf"):
+        return content
+    start, end = 0, len(content)
+    if suffix == ".glb":  # 12 bytes of header, then length, type and data of the JSON chunk
+        start, end = 20, 20 + int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[start:end])
+    missing = len(tree.setdefault("materials", []))
+    tree["materials"].append({})
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            primitive.setdefault("material", missing)
+    text = json.dumps(tree).encode()
+    if suffix == ".gltf":
+        return text
+    text += b" " * (-len(text) % 4)
+    total = len(content) - (end - start) + len(text)
+    sizes = (total.to_bytes(4, "little"), len(text).to_bytes(4, "little"))
+    return content[:8] + sizes[0] + sizes[1] + content[16:20] + text + content[end:]
+
+
+def _scene_parts(trimesh: ModuleType, scene: Any) -> Iterator[MeshPart]:
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -176,7 +199,7 @@ def _material(material: Any) -> dict[str, Any]:
     fields: dict[str, Any] = {
         field: np.array(numbers[key], dtype=np.float32)
         for field, key in (("ambient", "ka"), ("diffuse", "kd"), ("specular", "ks"))
-        if np.shape(numbers.get(key)) == (3,)
+        if key in numbers and np.shape(numbers[key]) == (3,)
     }
     if "ns" in numbers:
         fields["shininess"] = float(numbers["ns"])

@@ -54,6 +54,7 @@ SWEEP_CHUNK = 128
 _MARGIN = tuple(max(sizes) for sizes in zip(SWEEP_BLOCK, *BLOCKS, strict=True))
 
 
+@partial(jax.jit, static_argnames=("height", "width", "cull_backfaces"))
 def visible_faces(
     positions_clip: Float[Array, "V 4"],
     faces: Int[Array, "F 3"],

@@ -83,7 +83,8 @@ def snap_vertices(positions_clip: Float[Array, "V 4"], *, height: int, width: in
             (~regular, IRREGULAR),
         )
     )
-    parallel = jnp.all(w == w[0]) & (w[0] > 0)
+    largest_w = jnp.max(w)
+    parallel = jnp.all((w == largest_w) | ~finite) & (largest_w > 0)
     rank = jnp.where(parallel, -z, jnp.ones_like(w))
     return Vertices(x_fixed, y_fixed, x, y, z, w, rank, jnp.asarray(outcode, jnp.int32))
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from diffrast._check import float_array, index_array, positive_int
 from diffrast._pytree import pytree_dataclass
+from diffrast._stored import assemble, stored_rows
 from diffrast.raster.coverage import visible_faces
 
 
@@ -68,6 +69,7 @@ def rasterize(
     positions_clip = float_array("positions_clip", positions_clip, ("V", 4))
     faces = index_array("faces", faces, ("F", 3), bound=positions_clip.shape[0])
     height, width = positive_int("height", height), positive_int("width", width)
+    positions_clip = stored_rows(positions_clip, faces)
     face = visible_faces(
         lax.stop_gradient(positions_clip),
         faces,
@@ -76,9 +78,7 @@ def rasterize(
         cull_backfaces=bool(cull_backfaces),
     )
     barycentrics, inverse_depth = evaluate_fragments(positions_clip, faces, face)
-    return Fragments(
-        face=face, barycentrics=jnp.stack(barycentrics, -1), inverse_depth=inverse_depth
-    )
+    return Fragments(face=face, barycentrics=assemble(barycentrics), inverse_depth=inverse_depth)
 
 
 def evaluate_fragments(
@@ -95,7 +95,7 @@ def evaluate_fragments(
     # factors are exact.
     x_centre = (2 * jnp.arange(width) + 1 - width).astype(dtype)[None, :]
     y_centre = (height - 1 - 2 * jnp.arange(height)).astype(dtype)[:, None]
-    x_vertex, y_vertex, w_vertex = (positions_clip[:, i] for i in (0, 1, 3))
+    (x_vertex, y_vertex, w_vertex), unit = _scaled_columns(positions_clip)
 
     x, y, w = [], [], []
     for j in range(3):
@@ -115,8 +115,21 @@ def evaluate_fragments(
     barycentrics = [e * inverse_total for e in edge]
     depth = barycentrics[0] * w[0] + barycentrics[1] * w[1] + barycentrics[2] * w[2]
     positive = valid & (depth > 0)
-    inverse_depth = jnp.where(positive, 1, 0) / jnp.where(positive, depth, 1)
+    inverse_depth = jnp.where(positive, 1 / unit, 0) / jnp.where(positive, depth, 1)
     return barycentrics, inverse_depth
+
+
+def _scaled_columns(positions_clip: Array) -> tuple[list[Array], Array]:
+    """Columns x, y, w in units of about the largest of them, so that products stay in range.
+
+    The unit, also returned, is a power of two: the division rounds nothing. Positions that are not
+    finite become zero: no visible face has them, but the background evaluates face 0.
+    """
+    finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
+    columns = [jnp.where(finite, positions_clip[:, i], 0) for i in (0, 1, 3)]
+    largest = jnp.max(jnp.abs(lax.stop_gradient(jnp.stack(columns))))
+    unit = jnp.ldexp(jnp.ones_like(largest), jnp.frexp(largest)[1] - 1)
+    return [column / unit for column in columns], unit
 
 
 def _offset(numerator: Array, w: Array, size: int, centre: Array) -> Array:

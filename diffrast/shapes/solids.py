@@ -4,10 +4,10 @@ Sizes are the source's where it has round numbers: cube and tetrahedron have cor
 ±1), the tetrahedron four of the cube's eight; octahedron, icosahedron and dodecahedron have their
 corners on the unit sphere.
 
-Every solid comes in two forms. By default faces share their vertices (a cube has 8) and there are
-no normals: what is drawn is the flat faces, and the vertices can be moved, counted and copied.
-With `flat=True` each triangle has its own corners with the face's normal, for code that wants
-normals at vertices. Both have the same silhouettes. Faces are counter-clockwise from outside.
+Every solid comes in two forms with the same edges and silhouettes. By default each triangle has
+its own three corners with the face's normal, so that a solid looks faceted in every kind of
+shading. With `flat=False` faces share their vertices (a cube has 8) and there are no normals: the
+form to count, copy, subdivide, or fit by moving vertices. Faces are counter-clockwise from outside.
 """
 
 import numpy as np
@@ -15,20 +15,20 @@ import numpy as np
 from diffrast.mesh import Mesh, flat_shaded
 
 
-def cube(*, flat: bool = False) -> Mesh:
+def cube(*, flat: bool = True) -> Mesh:
     """Cube with corners (±1, ±1, ±1): edges of length 2, 12 triangles."""
     corners = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     squares = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     return _solid(np.array(corners), np.array(squares), flat)
 
 
-def tetrahedron(*, flat: bool = False) -> Mesh:
+def tetrahedron(*, flat: bool = True) -> Mesh:
     """Tetrahedron on four corners of the cube: edges of length 2√2."""
     corners = [[1, -1, -1], [-1, 1, -1], [1, 1, 1], [-1, -1, 1]]
     return _solid(np.array(corners), np.array([[0, 1, 2], [1, 3, 2], [0, 2, 3], [0, 3, 1]]), flat)
 
 
-def octahedron(*, flat: bool = False) -> Mesh:
+def octahedron(*, flat: bool = True) -> Mesh:
     """Octahedron with corners ±1 on the axes: edges of length √2."""
     corners = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1], [0, 0, 1]]
     side = np.arange(4)
@@ -38,12 +38,12 @@ def octahedron(*, flat: bool = False) -> Mesh:
     return _solid(np.array(corners), np.concatenate([upper, lower]), flat)
 
 
-def icosahedron(*, flat: bool = False) -> Mesh:
+def icosahedron(*, flat: bool = True) -> Mesh:
     """Icosahedron in the unit sphere, two corners on the z axis: 20 faces."""
     return _solid(*icosahedron_arrays(), flat)
 
 
-def dodecahedron(*, flat: bool = False) -> Mesh:
+def dodecahedron(*, flat: bool = True) -> Mesh:
     """Dodecahedron in the unit sphere, the dual of `icosahedron`: 12 pentagons, 36 triangles."""
     corners, triangles = icosahedron_arrays()
     centres = corners[triangles].sum(axis=1)

@@ -1,0 +1,164 @@
+"""Lights: from where light comes to a point, and how much of it.
+
+A light's `ambient`, `diffuse` and `specular` multiply the material's (FEATURES S1). What a light
+does not have (`None`) adds no operation: a light without `ambient` adds no ambient term, and an
+`AmbientLight` costs one addition.
+"""
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from diffrast._check import ArrayInput, float_array
+from diffrast._pytree import pytree_dataclass, set_field
+from diffrast.linalg import normalize
+
+Columns: TypeAlias = list[Array]  # x, y, z (or r, g, b), each of any one shape
+
+
+@pytree_dataclass
+class AmbientLight:
+    """Light from everywhere: `color` times the material's ambient reflectance."""
+
+    color: Float[Array, "3"]
+
+    def __init__(self, color: ArrayInput) -> None:
+        set_field(self, "color", float_array("color", color, (3,)))
+
+
+@pytree_dataclass
+class DirectionalLight:
+    """Light from infinitely far away.
+
+    Attributes:
+        direction: (3,) the way the light travels, of any length but zero; differentiable.
+        diffuse: (3,) linear RGB.
+        specular: (3,), equal to `diffuse` unless given.
+        ambient: (3,) or None.
+
+    Raises:
+        ValueError: for wrong shapes and numbers that are not finite.
+    """
+
+    direction: Float[Array, "3"]
+    diffuse: Float[Array, "3"]
+    specular: Float[Array, "3"]
+    ambient: Float[Array, "3"] | None
+
+    def __init__(
+        self,
+        *,
+        direction: ArrayInput,
+        ambient: ArrayInput | None = None,
+        diffuse: ArrayInput = (1.0, 1.0, 1.0),
+        specular: ArrayInput | None = None,
+    ) -> None:
+        set_field(self, "direction", float_array("direction", direction, (3,)))
+        _set_colors(self, ambient, diffuse, specular)
+
+
+@pytree_dataclass
+class PointLight:
+    """Light from a point, equally in all directions.
+
+    Attributes:
+        position: (3,) in the world; differentiable.
+        diffuse: (3,) linear RGB.
+        specular: (3,), equal to `diffuse` unless given.
+        ambient: (3,) or None.
+        attenuation: (3,) a, b, c: diffuse and specular light is divided by a + b r + c r² at the
+            distance r; None for no attenuation.
+
+    Raises:
+        ValueError: for wrong shapes and numbers that are not finite.
+    """
+
+    position: Float[Array, "3"]
+    diffuse: Float[Array, "3"]
+    specular: Float[Array, "3"]
+    ambient: Float[Array, "3"] | None
+    attenuation: Float[Array, "3"] | None
+
+    def __init__(
+        self,
+        *,
+        position: ArrayInput,
+        ambient: ArrayInput | None = None,
+        diffuse: ArrayInput = (1.0, 1.0, 1.0),
+        specular: ArrayInput | None = None,
+        attenuation: ArrayInput | None = None,
+    ) -> None:
+        set_field(self, "position", float_array("position", position, (3,)))
+        _set_colors(self, ambient, diffuse, specular)
+        if attenuation is not None:
+            attenuation = float_array("attenuation", attenuation, (3,))
+        set_field(self, "attenuation", attenuation)
+
+
+Light: TypeAlias = AmbientLight | DirectionalLight | PointLight
+
+
+def _set_colors(
+    light: DirectionalLight | PointLight,
+    ambient: ArrayInput | None,
+    diffuse: ArrayInput,
+    specular: ArrayInput | None,
+) -> None:
+    if ambient is not None:
+        ambient = float_array("ambient", ambient, (3,))
+    set_field(light, "ambient", ambient)
+    set_field(light, "diffuse", float_array("diffuse", diffuse, (3,)))
+    if specular is None:
+        specular = diffuse
+    set_field(light, "specular", float_array("specular", specular, (3,)))
+
+
+def total_ambient(lights: tuple[Light, ...]) -> Float[Array, "3"] | None:
+    """Sum of the lights' ambient colours; None if no light has one."""
+    colors = [light.color if isinstance(light, AmbientLight) else light.ambient for light in lights]
+    present = [color for color in colors if color is not None]
+    return sum(present[1:], start=present[0]) if present else None
+
+
+def needs_position(light: Light) -> bool:
+    """Whether the light at a point depends on where the point is."""
+    return isinstance(light, PointLight)
+
+
+def incoming(
+    light: DirectionalLight | PointLight, position: Columns | None
+) -> tuple[Columns, Array | None]:
+    """Unit direction to the light, and the factor on its colours (None for one).
+
+    Args:
+        light: any but an ambient one.
+        position: world positions as columns; may be None where `needs_position` is false.
+    """
+    if isinstance(light, DirectionalLight):
+        direction = -normalize(light.direction)
+        return [direction[i] for i in range(3)], None
+    assert position is not None
+    offset = [light.position[i] - position[i] for i in range(3)]
+    direction, distance = normalize_columns(offset)
+    if light.attenuation is None:
+        return direction, None
+    a, b, c = (light.attenuation[i] for i in range(3))
+    divisor = a + distance * (b + distance * c)
+    return direction, jnp.where(divisor > 0, 1, 0) / jnp.where(divisor > 0, divisor, 1)
+
+
+def normalize_columns(vector: Columns) -> tuple[Columns, Array]:
+    """Unit vector and length, kept as columns; a zero vector gives zeros, with zero gradients.
+
+    Lengths are taken relative to the largest component, so that no square over- or underflows.
+    """
+    largest = jnp.maximum(jnp.maximum(jnp.abs(vector[0]), jnp.abs(vector[1])), jnp.abs(vector[2]))
+    positive = largest > 0
+    inverse = 1 / jnp.where(positive, largest, 1)
+    scaled = [component * inverse for component in vector]
+    square = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
+    length = jnp.sqrt(jnp.where(positive, square, 1))
+    unit = jnp.where(positive, 1, 0) / length
+    return [component * unit for component in scaled], jnp.where(positive, length * largest, 0)

@@ -1,0 +1,362 @@
+import builtins
+import dataclasses
+import json
+import logging
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from diffrast import mesh as dm
+from diffrast import shapes
+from diffrast.files.meshes import SUFFIXES, load_mesh, load_mesh_parts, save_mesh
+
+MODELS = Path(__file__).parents[1] / ".." / "shared" / "data" / "meshes"
+HOLDS_NORMALS = (".obj", ".ply", ".glb", ".gltf")
+
+
+def corners(mesh, name="vertices"):
+    """Values at the corners of the faces: what a mesh is, however its vertices are numbered."""
+    return np.asarray(getattr(mesh, name))[np.asarray(mesh.faces)]
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+# ----------------------------------------------------------------------------------- round trips
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("full", [True, False])
+def test_round_trip_keeps_everything_the_format_holds(tmp_path, suffix, full):
+    mesh = shapes.torus(1.0, 1 / 3, major_segments=5, minor_segments=4)
+    if not full:
+        mesh = dataclasses.replace(mesh, normals=None, uvs=None)
+    path = tmp_path / f"torus{suffix.upper() if full else suffix}"
+    save_mesh(path, mesh)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    read = load_mesh(str(path))
+    np.testing.assert_array_equal(corners(read), corners(mesh))
+    if suffix != ".stl":
+        np.testing.assert_array_equal(read.faces, mesh.faces)
+    if full and suffix in HOLDS_NORMALS:
+        np.testing.assert_allclose(corners(read, "normals"), corners(mesh, "normals"), atol=1e-6)
+        np.testing.assert_allclose(corners(read, "uvs"), corners(mesh, "uvs"), atol=1e-6)
+    else:
+        assert read.normals is None
+        assert read.uvs is None
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_nothing_is_merged_dropped_or_lost_to_few_digits(tmp_path, suffix):
+    # Copies of vertices, a face without area, a vertex that no face uses, far from unit size.
+    mesh = shapes.cube()
+    spare = jnp.ones((1, 3))
+    mesh = dm.Mesh(
+        vertices=jnp.concatenate([mesh.vertices, spare]) * np.float32(1 / 3e12),
+        faces=jnp.concatenate([mesh.faces, jnp.array([[0, 0, 1]])]),
+    )
+    save_mesh(tmp_path / f"cube{suffix}", mesh)
+    read = load_mesh(tmp_path / f"cube{suffix}")
+    np.testing.assert_array_equal(corners(read), corners(mesh))
+    if suffix != ".stl":
+        np.testing.assert_array_equal(read.vertices, mesh.vertices)
+
+
+def test_attributes_survive_on_vertices_that_no_face_uses(tmp_path):
+    mesh = dm.Mesh(
+        vertices=np.arange(12).reshape(4, 3),
+        faces=[[0, 1, 3]],
+        normals=np.eye(4, 3),
+        uvs=np.arange(8).reshape(4, 2) / 8,
+    )
+    for suffix in HOLDS_NORMALS:
+        save_mesh(tmp_path / f"one{suffix}", mesh)
+        read = load_mesh(tmp_path / f"one{suffix}")
+        for name in ("vertices", "normals", "uvs"):
+            np.testing.assert_allclose(corners(read, name), corners(mesh, name), err_msg=suffix)
+
+
+# ------------------------------------------------------------------------------------------- OBJ
+
+QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def test_obj_polygons_become_fans_in_their_order(tmp_path):
+    text = QUAD + "v 2 0 0\nf 1 2 3 4\nf 2 5 3\nf 1 2 5 3 4\n"
+    read = load_mesh(write(tmp_path / "a.obj", text))
+    want = [[0, 1, 2], [0, 2, 3], [1, 4, 2], [0, 1, 4], [0, 4, 2], [0, 2, 3]]
+    np.testing.assert_array_equal(read.faces, want)
+
+
+def test_obj_relative_indices_count_back_from_their_line(tmp_path):
+    text = "v 9 9 9\n" + QUAD + "f -4 -3 -2 -1\nv 0 0 5\nf -1 -4 2\n"
+    read = load_mesh(write(tmp_path / "a.obj", text))
+    np.testing.assert_array_equal(read.faces, [[1, 2, 3], [1, 3, 4], [5, 2, 1]])
+    text = QUAD + "vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 2\nf -4/-3/-1 -3/-2/-1 -2/-1/-1\n"
+    read = load_mesh(write(tmp_path / "b.obj", text))
+    np.testing.assert_array_equal(corners(read, "uvs"), [[[0, 0], [1, 0], [1, 1]]])
+    np.testing.assert_array_equal(read.normals, np.tile([0, 0, 1], (3, 1)))
+
+
+def test_obj_splits_vertices_on_seams_only(tmp_path):
+    uvs = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt .5 .5\n"
+    text = QUAD + uvs + "f 1/1 2/2 3/3\nf 1/1 3/5 4/4\n"
+    read = load_mesh(write(tmp_path / "a.obj", text))
+    assert read.vertices.shape == (5, 3)
+    np.testing.assert_allclose(corners(read, "uvs")[1], [[0, 0], [0.5, 0.5], [0, 1]])
+    np.testing.assert_array_equal(corners(read)[1], [[0, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+def test_obj_syntax_that_other_programs_write(tmp_path):
+    text = (
+        "# comment\r\nmtllib none.mtl\r\no thing\r\n\tv  0 0 0 1.0 # w\r\nv 1e0 +0 0 .5 .5 .5\r\n"
+        "v 1 1\\\r\n 0\r\nvn 0 0 1\r\ng side\r\nusemtl red\r\ns off\r\nf 1//1 2//1 \\\r\n 3//1\r\n"
+        "l 1 2\r\nvp 0 0\r\n"
+    )
+    path = tmp_path / "a.obj"
+    path.write_bytes(text.encode())
+    read = load_mesh(path)
+    np.testing.assert_array_equal(corners(read), [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]])
+    np.testing.assert_array_equal(read.normals, np.tile([0, 0, 1], (3, 1)))
+
+
+def test_obj_attributes_of_some_faces_only_are_left_out(tmp_path):
+    text = QUAD + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1\n"
+    read = load_mesh(write(tmp_path / "a.obj", text))
+    assert read.uvs is None
+    assert read.normals is not None
+
+
+def test_materials_and_textures(tmp_path):
+    Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8)).save(tmp_path / "t.png")
+    write(
+        tmp_path / "m.mtl",
+        "newmtl one\nKa .1 .1 .1\nKd .8 .7 .6\nKs 1 1 1\nNs 20\nmap_Kd t.png\n"
+        "newmtl two\nKd 0 0 1\n",
+    )
+    text = (
+        "mtllib m.mtl\n" + QUAD + "vt 0 0\nusemtl one\nf 1/1 2/1 3/1\nusemtl two\nf 1/1 3/1 4/1\n"
+    )
+    path = write(tmp_path / "a.obj", text)
+    first, second = load_mesh_parts(path)
+    np.testing.assert_allclose(first.ambient, [0.1, 0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(first.diffuse, [0.8, 0.7, 0.6], rtol=1e-6)
+    np.testing.assert_allclose(first.specular, [1, 1, 1])
+    assert first.shininess == 20
+    np.testing.assert_allclose(first.texture, [[[1, 0, 0], [0, 0.502886, 0]]], atol=1e-5)
+    np.testing.assert_array_equal(corners(first.mesh), [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]])
+    np.testing.assert_allclose(second.diffuse, [0, 0, 1])
+    assert second.texture is None
+    assert (first.name, second.name) == ("one", "two")
+    np.testing.assert_array_equal(load_mesh(path).faces, [[0, 1, 2], [0, 2, 3]])
+    (tmp_path / "m.mtl").unlink()
+    assert all(part.diffuse is None for part in load_mesh_parts(path))
+
+
+# ---------------------------------------------------------------------------------- other formats
+
+
+def test_several_gltf_nodes_are_merged_in_their_places(tmp_path):
+    save_mesh(tmp_path / "one.gltf", shapes.cube())
+    tree = json.loads((tmp_path / "one.gltf").read_text())
+    mesh_node = next(k for k, node in enumerate(tree["nodes"]) if "mesh" in node)
+    mirrored = {"mesh": tree["nodes"][mesh_node]["mesh"], "name": "mirrored"}
+    tree["nodes"].append({**mirrored, "scale": [-1, 1, 1], "translation": [5, 0, 0]})
+    tree["nodes"][tree["scenes"][0]["nodes"][0]].setdefault("children", []).append(
+        len(tree["nodes"]) - 1
+    )
+    write(tmp_path / "two.gltf", json.dumps(tree))
+    read = load_mesh(tmp_path / "two.gltf")
+    assert read.faces.shape == (24, 3)
+    np.testing.assert_allclose(dm.signed_volume(read), 16, rtol=1e-6)
+    assert read.vertices[:, 0].max() == 6
+    facets = dm.face_normals(read.vertices, read.faces)
+    np.testing.assert_allclose(facets, read.normals[read.faces[:, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+def test_gltf_without_a_material_keeps_its_uvs(tmp_path, suffix):
+    mesh = shapes.plane(divisions=2)
+    path = tmp_path / f"a{suffix}"
+    save_mesh(path, mesh)
+    # The same number of bytes, so that lengths stay right.
+    path.write_bytes(path.read_bytes().replace(b'"material":', b'"ignored_":'))
+    np.testing.assert_allclose(load_mesh(path).uvs, mesh.uvs, atol=1e-6)
+    (part,) = load_mesh_parts(path)
+    assert part.texture is None
+    assert part.diffuse is None
+
+
+def test_gltf_base_colour(tmp_path):
+    save_mesh(tmp_path / "a.gltf", shapes.plane())
+    tree = json.loads((tmp_path / "a.gltf").read_text())
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.4, 1, 1]}}]
+    (part,) = load_mesh_parts(write(tmp_path / "b.gltf", json.dumps(tree)))
+    np.testing.assert_allclose(part.diffuse, [0.2, 0.4, 1], atol=1 / 255)
+
+
+def test_text_forms_of_ply_off_and_stl(tmp_path):
+    ply = (
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+    )
+    mixed = load_mesh(write(tmp_path / "a.ply", ply + "3 0 1 2\n4 0 1 2 3\n"))
+    assert mixed.faces.shape == (3, 3)
+    np.testing.assert_allclose(dm.face_areas(mixed.vertices, mixed.faces).sum(), 1.5)
+    off = load_mesh(
+        write(tmp_path / "a.off", "OFF # c\n4 1 0\n" + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3")
+    )
+    assert off.faces.shape == (2, 3)
+    facet = f"{FACET}vertex 0 1 0\nendloop\nendfacet\n"
+    stl = load_mesh(write(tmp_path / "a.stl", f"solid a b\n{facet}endsolid a b\n"))
+    np.testing.assert_array_equal(corners(stl), [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    assert stl.normals is None
+
+
+# ---------------------------------------------------------------------------------------- errors
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("a.obj", "v 0 0\n", "a.obj:1: wanted 3 numbers after v, got '0 0'"),
+        ("a.obj", "\nv 0 0 x\n", "a.obj:2: wanted 3 numbers after v, got '0 0 x'"),
+        ("a.obj", "v 0 0 nan\n", "a.obj:1: wanted 3 numbers after v"),
+        ("a.obj", QUAD + "f 1 2 5\n", "a.obj:5: wanted an index of at most 4, .* v .*got 5"),
+        ("a.obj", QUAD + "f 1 2 0\n", "a.obj:5: wanted a corner .*, got '0'"),
+        ("a.obj", QUAD + "f 1 2 -5\n", "a.obj:5: wanted a corner .* back to -4, got '-5'"),
+        ("a.obj", QUAD + "f 1 2 3.5\n", "a.obj:5: wanted a corner .*, got '3.5'"),
+        ("a.obj", QUAD + "f 1/1 2/1 3/1\n", "a.obj:5: wanted an index of at most 0, .* vt"),
+        ("a.obj", QUAD + "f 1 2\n", "a.obj:5: wanted at least 3 corners after f, got '1 2'"),
+        ("a.obj", QUAD, "a.obj: wanted a mesh with faces"),
+        ("a.obj", "", "a.obj: wanted a mesh with faces"),
+        ("a.obj", "v 0 0 0\n\0\1", "a.obj:2: wanted text, got binary data"),
+        ("a.off", "COFFEE\n", "a.off:1: wanted the word OFF"),
+        ("a.off", "OFF\n3\n", "a.off:2: wanted the numbers of vertices and faces, got '3'"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n", "a.off:4: wanted vertex 2, got the end"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0\n0 0 0\n3 0 1 2", "a.off:4: wanted three numbers"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n", "a.off:5: wanted face 0, got the end"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3", r"a.off:6: .* in \[0, 3\), got"),
+        ("a.ply", PLY + "0 0 0\n1 0 0\n", "a.ply:11: wanted vertex 2, got the end"),
+        ("a.ply", PLY + "0 0 0\n1 0 0\n0 1\n3 0 1 2\n", "a.ply:12: wanted 3 numbers for vertex 2"),
+        ("a.ply", PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", r"a.ply:13: .* in \[0, 3\)"),
+        ("a.ply", PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "a.ply:13: wanted a number of corners"),
+        (
+            "a.ply",
+            PLY.replace("face 1", "face 0") + "0 0 0\n1 0 0\n0 1 0\n",
+            "a.ply: wanted a mesh",
+        ),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply"),
+        ("a.stl", f"solid\n{FACET}vertex 0 1\n", "a.stl:6: wanted three numbers, got '0 1'"),
+        ("a.stl", f"solid\n{FACET}endloop\n", "a.stl:6: wanted facets of three vertices"),
+        ("a.stl", f"solid\n{FACET}vertex 0 1 0\n", "a.stl:6: wanted endsolid, got the end"),
+        ("a.stl", "solid\nendsolid\n", "a.stl: wanted a mesh with faces"),
+        ("a.gltf", "{", "a.gltf: cannot be read as GLTF"),
+        ("a.gltf", "{}", "a.gltf"),
+        ("a.xyz", "", "a.xyz: wanted a suffix among .glb, .gltf, .obj.*got '.xyz'"),
+        ("mesh", "", "mesh: wanted a suffix among"),
+    ],
+)
+def test_broken_files_are_named_with_their_line(tmp_path, file, text, message):
+    with pytest.raises(ValueError, match=message):
+        load_mesh(write(tmp_path / file, text))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_truncated_and_random_files_are_value_errors(tmp_path, suffix):
+    whole = tmp_path / f"whole{suffix}"
+    save_mesh(whole, shapes.icosahedron())
+    content = whole.read_bytes()
+    path = tmp_path / f"broken{suffix}"
+    rng = np.random.default_rng(0)
+    for broken in (
+        b"",
+        content[:10],
+        content[: len(content) // 2],
+        content[:-5],
+        rng.bytes(500),
+        content[:84] + rng.bytes(len(content) - 84),
+    ):
+        path.write_bytes(broken)
+        if broken == content[:-5] and suffix == ".obj":
+            continue  # a last index of fewer digits is a valid file
+        with pytest.raises(ValueError, match=f"broken{suffix}"):
+            load_mesh(path)
+
+
+def test_files_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.obj"):
+        load_mesh(tmp_path / "none.obj")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(OSError, match=r"folder\.ply"):
+        load_mesh(tmp_path / "folder.ply")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        save_mesh(tmp_path / "nowhere" / "a.ply", shapes.cube())
+    with pytest.raises(ValueError, match="wanted a suffix among"):
+        save_mesh(tmp_path / "a.png", shapes.cube())
+
+
+def test_reading_says_nothing(tmp_path, capfd):
+    save_mesh(tmp_path / "a.ply", shapes.cube())
+    load_mesh(tmp_path / "a.ply")
+    (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-3])
+    with pytest.raises(ValueError, match=r"b\.ply"):
+        load_mesh(tmp_path / "b.ply")
+    assert capfd.readouterr() == ("", "")
+    assert not logging.getLogger("trimesh").disabled
+
+
+def test_without_trimesh_the_error_says_what_to_install(tmp_path, monkeypatch):
+    save_mesh(tmp_path / "a.ply", shapes.cube())
+    real_import = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name.split(".")[0] == "trimesh":
+            raise ImportError(name)
+        return real_import(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.delitem(sys.modules, "trimesh")
+    with pytest.raises(ImportError, match=r"pip install diffrast\[mesh\]"):
+        load_mesh(tmp_path / "a.ply")
+
+
+# ---------------------------------------------------------------------------------- common models
+
+
+@pytest.mark.parametrize(
+    ("name", "faces", "characteristic"),
+    [
+        ("spot", 5856, 2),
+        ("suzanne", 968, None),
+        ("fandisk", 12946, 2),
+        ("stanford-bunny", 69451, None),
+    ],
+)
+def test_common_models(name, faces, characteristic):
+    path = MODELS / f"{name}.obj"
+    if not path.exists():
+        pytest.skip(f"the common test models are not at {MODELS}")
+    mesh = load_mesh(path)
+    assert mesh.faces.shape == (faces, 3)
+    assert (mesh.uvs is not None) == (name == "spot")
+    if characteristic is not None:
+        assert dm.euler_characteristic(mesh) == characteristic
+        assert dm.is_closed(mesh)
+        assert dm.signed_volume(mesh) > 0
+    smooth = dm.with_normals(mesh)
+    used = np.unique(mesh.faces)
+    np.testing.assert_allclose(jnp.linalg.norm(smooth.normals[used], axis=1), 1, rtol=1e-5)
