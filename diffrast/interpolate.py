@@ -49,6 +49,6 @@ def interpolate_columns(
 ) -> list[Float[Array, "height width"]]:
     """Interpolate attributes kept apart, which XLA fuses far better than stacked ones."""
     corners = faces[jnp.maximum(face, 0)]
-    return [
-        sum(b * column[corners[..., j]] for j, b in enumerate(barycentrics)) for column in columns
-    ]
+    b0, b1, b2 = barycentrics
+    i0, i1, i2 = (corners[..., j] for j in range(3))
+    return [b0 * column[i0] + b1 * column[i1] + b2 * column[i2] for column in columns]

@@ -8,7 +8,7 @@ does not have (`None`) adds no operation: a light without `ambient` adds no ambi
 from typing import TypeAlias
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from diffrast._check import ArrayInput, float_array
@@ -137,8 +137,8 @@ def incoming(
         position: world positions as columns; may be None where `needs_position` is false.
     """
     if isinstance(light, DirectionalLight):
-        direction = -normalize(light.direction)
-        return [direction[i] for i in range(3)], None
+        to_light = -normalize(light.direction)
+        return [to_light[i] for i in range(3)], None
     assert position is not None
     offset = [light.position[i] - position[i] for i in range(3)]
     direction, distance = normalize_columns(offset)
@@ -152,9 +152,11 @@ def incoming(
 def normalize_columns(vector: Columns) -> tuple[Columns, Array]:
     """Unit vector and length, kept as columns; a zero vector gives zeros, with zero gradients.
 
-    Lengths are taken relative to the largest component, so that no square over- or underflows.
+    Lengths are taken relative to the largest component, so that no square over- or underflows; it
+    carries no gradient, for it cancels.
     """
-    largest = jnp.maximum(jnp.maximum(jnp.abs(vector[0]), jnp.abs(vector[1])), jnp.abs(vector[2]))
+    x, y, z = (jnp.abs(lax.stop_gradient(component)) for component in vector)
+    largest = jnp.maximum(jnp.maximum(x, y), z)
     positive = largest > 0
     inverse = 1 / jnp.where(positive, largest, 1)
     scaled = [component * inverse for component in vector]

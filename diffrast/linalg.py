@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from diffrast._check import ArrayInput, float_array, is_concrete
 
@@ -218,6 +218,12 @@ def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     orientation = jnp.where(dot(a, cofactors[:, 0]) < 0, -1, 1)
     return normalize(apply_matrix(orientation * cofactors, normals))
+
+
+def mirrors(matrix: ArrayInput) -> Bool[Array, ""]:
+    """Whether a 4x4 matrix turns right-handed into left-handed, and so the faces of meshes round."""
+    x, y, z = normalize(float_array("matrix", matrix, (4, 4), finite=False)[:3, :3])
+    return dot(jnp.cross(x, y), z) < 0
 
 
 def _matrix_and_vectors(matrix: ArrayInput, name: str, vectors: ArrayInput) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from diffrast import _check, _topology
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass, set_field
 from diffrast._topology import EdgeAdjacency as EdgeAdjacency
-from diffrast.linalg import dot, norm, normalize, transform_normals, transform_points
+from diffrast.linalg import dot, mirrors, norm, normalize, transform_normals, transform_points
 
 WEIGHTINGS = ("area", "angle", "uniform")
 
@@ -249,11 +249,9 @@ def transform(mesh: Mesh, matrix: ArrayInput) -> Mesh:
     faces round, so that they stay counter-clockwise from outside.
     """
     matrix = _check.float_array("matrix", matrix, (4, 4))
-    x, y, z = normalize(matrix[:3, :3])
-    mirrors = dot(jnp.cross(x, y), z) < 0
     return Mesh(
         vertices=transform_points(matrix, mesh.vertices),
-        faces=jnp.where(mirrors, mesh.faces[:, ::-1], mesh.faces),
+        faces=jnp.where(mirrors(matrix), mesh.faces[:, ::-1], mesh.faces),
         normals=None if mesh.normals is None else transform_normals(matrix, mesh.normals),
         uvs=mesh.uvs,
     )

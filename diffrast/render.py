@@ -27,7 +27,7 @@ from diffrast.light import (
     PointLight,
     normalize_columns,
 )
-from diffrast.linalg import transform_normals, transform_points
+from diffrast.linalg import mirrors, transform_normals, transform_points
 from diffrast.material import Material
 from diffrast.mesh import Mesh, face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
@@ -45,7 +45,7 @@ class Object:
         mesh: in its own coordinates.
         material: its reflectances.
         transform: (4, 4) object to world, traced and differentiable; normals follow by its inverse
-            transpose.
+            transpose, and what was outside stays outside where it mirrors.
     """
 
     mesh: Mesh
@@ -92,6 +92,8 @@ class Scene:
             ("objects", objects, (Object,)),
             ("lights", lights, (AmbientLight, DirectionalLight, PointLight)),
         ):
+            if not isinstance(items, tuple | list):
+                raise ValueError(f"{name}: wanted a tuple or list, got {type(items).__name__}")
             for i, item in enumerate(items):
                 if not isinstance(item, kinds):
                     wanted = " or ".join(kind.__name__ for kind in kinds)
@@ -244,10 +246,11 @@ class _Geometry(NamedTuple):
 
     positions: Float[Array, "V 3"]
     faces: Int[Array, "F 3"]
+    faces_outward: Int[Array, "F 3"]  # turned round where a transform mirrors
     normals: Float[Array, "V 3"] | None  # None for flat and unlit shading
     uvs: Float[Array, "V 2"] | None
-    object_of_face: np.ndarray | Array
-    object_of_vertex: np.ndarray | Array
+    object_of_face: Int[Array, " F"]
+    object_of_vertex: Int[Array, " V"]
 
 
 class _Pixels(NamedTuple):
@@ -258,7 +261,7 @@ class _Pixels(NamedTuple):
 
 def _world_geometry(scene: Scene, shading: str) -> _Geometry:
     with jax.named_scope("geometry"):
-        positions, faces, normals, uvs = [], [], [], []
+        positions, faces, faces_outward, normals, uvs = [], [], [], [], []
         smooth = shading in ("phong", "gouraud")
         textured = any(item.mesh.uvs is not None for item in scene.objects)
         first_vertex = 0
@@ -266,6 +269,8 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
             mesh = item.mesh
             positions.append(transform_points(item.transform, mesh.vertices))
             faces.append(mesh.faces + first_vertex)
+            turned = jnp.where(mirrors(item.transform), faces[-1][:, ::-1], faces[-1])
+            faces_outward.append(turned)
             first_vertex += mesh.vertices.shape[0]
             if smooth:
                 own = mesh.normals
@@ -274,7 +279,8 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
                 normals.append(transform_normals(item.transform, own))
             if textured:
                 own = mesh.uvs
-                uvs.append(jnp.zeros((mesh.vertices.shape[0], 2)) if own is None else own)
+                none = jnp.zeros_like(mesh.vertices[:, :2])
+                uvs.append(none if own is None else own)
         all_faces = jnp.concatenate(faces)
 
         def joined(parts: list[Array]) -> Array:
@@ -284,6 +290,7 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
         return _Geometry(
             joined(positions),
             all_faces,
+            jnp.concatenate(faces_outward),
             joined(normals) if smooth else None,
             joined(uvs) if textured else None,
             jnp.asarray(np.repeat(counts, [o.mesh.faces.shape[0] for o in scene.objects])),
@@ -300,7 +307,7 @@ def _visible(
     with jax.named_scope("rasterize"):
         face = visible_faces(
             jax.lax.stop_gradient(positions_clip),
-            geometry.faces,
+            geometry.faces_outward if cull_backfaces else geometry.faces,
             height=height,
             width=width,
             cull_backfaces=cull_backfaces,
@@ -315,7 +322,7 @@ def _at_pixels(attribute: Array, geometry: _Geometry, pixels: _Pixels) -> Column
 
 
 def _flat_normals(geometry: _Geometry, face: Array) -> Columns:
-    normals = face_normals(geometry.positions, geometry.faces)
+    normals = face_normals(geometry.positions, geometry.faces_outward)
     visible = jnp.maximum(face, 0)
     return [normals[:, i][visible] for i in range(3)]
 

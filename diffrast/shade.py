@@ -88,11 +88,12 @@ def _highlight(
 ) -> Array:
     """max(r·v, 0)^m where the light is in front of the surface.
 
-    The power is exp(m log x) behind a mask: finite, with finite derivatives, also at x = 0.
+    The power is exp(m log x) behind a mask: finite, with finite derivatives, also at x = 0. What
+    rounding adds to x = 1 is cut off, since a large m would make it infinite.
     """
     along = 2 * cosine * _dot(normal, to_viewer) - _dot(to_light, to_viewer)
     visible = (along > 0) & (cosine > 0)
-    power = jnp.exp(shininess * jnp.log(jnp.where(visible, along, 1)))
+    power = jnp.exp(shininess * jnp.log(jnp.where(visible & (along < 1), along, 1)))
     return jnp.where(visible, power, 0)
 
 

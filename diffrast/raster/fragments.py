@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from diffrast._check import float_array, index_array, positive_int
 from diffrast._pytree import pytree_dataclass
-from diffrast._stored import assemble, stored_rows
+from diffrast._stored import assemble, stored, stored_rows
 from diffrast.raster.coverage import visible_faces
 
 
@@ -64,10 +64,13 @@ def rasterize(
         The fragments. Barycentrics and inverse depth are differentiable in `positions_clip`.
 
     Raises:
-        ValueError: for wrong shapes, indices out of range, clip positions that are not finite.
+        ValueError: for wrong shapes, indices out of range, no faces, and clip positions that are
+            not finite (while tracing, faces with such positions are not drawn).
     """
     positions_clip = float_array("positions_clip", positions_clip, ("V", 4))
     faces = index_array("faces", faces, ("F", 3), bound=positions_clip.shape[0])
+    if faces.shape[0] == 0:
+        raise ValueError("faces: wanted at least one face, got none")
     height, width = positive_int("height", height), positive_int("width", width)
     positions_clip = stored_rows(positions_clip, faces)
     face = visible_faces(
@@ -112,7 +115,7 @@ def evaluate_fragments(
     total = edge[0] + edge[1] + edge[2]
     valid = covered & (total != 0)
     inverse_total = jnp.where(valid, 1, 0) / jnp.where(valid, total, 1)
-    barycentrics = [e * inverse_total for e in edge]
+    barycentrics = stored([e * inverse_total for e in edge], faces)
     depth = barycentrics[0] * w[0] + barycentrics[1] * w[1] + barycentrics[2] * w[2]
     positive = valid & (depth > 0)
     inverse_depth = jnp.where(positive, 1 / unit, 0) / jnp.where(positive, depth, 1)

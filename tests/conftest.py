@@ -1,0 +1,11 @@
+"""Annotations of the library are checked at every call; plots need no display."""
+
+import matplotlib
+from beartype import BeartypeConf, beartype
+from jaxtyping import install_import_hook
+
+# As for mypy, an int will do where a float is wanted.
+check_annotations = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+install_import_hook("diffrast", f"{__name__}.check_annotations")
+matplotlib.use("Agg")
