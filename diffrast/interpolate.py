@@ -2,16 +2,15 @@
 
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from diffrast._check import float_array, index_array
+from diffrast._check import ArrayInput, float_array, index_array
 from diffrast._stored import assemble
 from diffrast.raster import Fragments
 
 
 def interpolate(
-    attributes: ArrayLike, faces: ArrayLike, fragments: Fragments
+    attributes: ArrayInput, faces: ArrayInput, fragments: Fragments
 ) -> Float[Array, "height width channels"]:
     """Interpolate vertex attributes at every pixel.
 

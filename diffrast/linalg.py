@@ -221,7 +221,7 @@ def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "
 
 
 def mirrors(matrix: ArrayInput) -> Bool[Array, ""]:
-    """Whether a 4x4 matrix turns right-handed into left-handed, and so the faces of meshes round."""
+    """Whether a 4x4 matrix mirrors: turns right hands into left ones, and the faces of meshes."""
     x, y, z = normalize(float_array("matrix", matrix, (4, 4), finite=False)[:3, :3])
     return dot(jnp.cross(x, y), z) < 0
 

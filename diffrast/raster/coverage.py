@@ -76,7 +76,7 @@ def visible_faces(
         )
         order, starts = group_by_class(classes)
         image = Image(height, width, subpixel_bits(height, width))
-        buffer = _empty_buffer(image, positions_clip.dtype)
+        buffer = _empty_buffer(image, positions_clip.dtype, starts[0] & 0)
         for size, block in enumerate(BLOCKS):
             buffer = _draw_blocks(
                 buffer, vertices, faces, order, (starts[size], starts[size + 1]), block, image
@@ -94,10 +94,12 @@ def visible_faces(
 # The depth buffer ---------------------------------------------------------------------------------
 
 
-def _empty_buffer(image: Image, dtype: jnp.dtype) -> Array:
+def _empty_buffer(image: Image, dtype: jnp.dtype, zero: Array) -> Array:
+    """Depth keys of -inf and ids of -1; `zero` makes them vary as the data do under `shard_map`."""
     # Blocks begin inside the image and may reach beyond it.
     shape = (image.height + _MARGIN[0], image.width + _MARGIN[1])
-    return lax.complex(jnp.full(shape, -jnp.inf, dtype), _id_as_float(jnp.full(shape, -1), dtype))
+    background = _id_as_float(jnp.full(shape, -1) + zero, dtype)
+    return lax.complex(jnp.full(shape, -jnp.inf, dtype), background)
 
 
 def _id_as_float(face: Array, dtype: jnp.dtype) -> Array:
@@ -238,8 +240,8 @@ def _draw_sweeps(
                 buffer,
             )
 
-        unset = jnp.full((), -1, jnp.int32)
-        state = (jnp.zeros((), jnp.int32), unset, unset, buffer)
+        zero = stop & 0
+        state = (zero, zero - 1, zero - 1, buffer)
         count = jnp.minimum(stop - start, SWEEP_CHUNK)
         return lax.while_loop(lambda s: s[0] < count, draw, state)[3]
 

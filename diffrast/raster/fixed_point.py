@@ -166,7 +166,8 @@ def group_by_class(classes: Int[Array, " F"]) -> tuple[Int[Array, " F"], Int[Arr
     def add(total: Array, column: Array) -> tuple[Array, Array]:
         return total + column, total
 
-    totals, before = lax.scan(add, jnp.zeros(runs, jnp.int32), one.T)
+    # The start is made from the data so that, under `shard_map`, it varies like them.
+    totals, before = lax.scan(add, one[:, 0] & 0, one.T)
     mask = (1 << field) - 1
     totals = (totals[None, :] >> (field * jnp.arange(CULLED)[:, None])) & mask
     ends = jnp.cumsum(totals.reshape(-1)).reshape(CULLED, runs)

@@ -10,10 +10,9 @@ coordinate of corner 0, and so on in turn, for every sign of w. Nothing is divid
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from diffrast._check import float_array, index_array, positive_int
+from diffrast._check import ArrayInput, float_array, index_array, positive_int
 from diffrast._pytree import pytree_dataclass
 from diffrast._stored import assemble, stored, stored_rows
 from diffrast.raster.coverage import visible_faces
@@ -37,8 +36,8 @@ class Fragments:
 
 
 def rasterize(
-    positions_clip: ArrayLike,
-    faces: ArrayLike,
+    positions_clip: ArrayInput,
+    faces: ArrayInput,
     *,
     height: int,
     width: int,
