@@ -1,4 +1,4 @@
-"""What the experiments share: fitting problems from files, and results as pictures, plots and JSON."""
+"""What the experiments share: problems from files; results as pictures, plots and JSON."""
 
 import argparse
 import dataclasses
@@ -18,7 +18,7 @@ DEFAULT_TARGET = Path(__file__).parent / "data" / "teapot_one_light.json"
 UNKNOWN_MATERIAL: dict[str, Any] = {
     "diffuse": (0.5, 0.5, 0.5),
     "specular": (0.3, 0.3, 0.3),
-    "shininess": 16.0,
+    "shininess": 12.0,
 }
 LIGHTS = {"directional": dr.DirectionalLight, "point": dr.PointLight}
 

@@ -7,10 +7,16 @@ farther, are fitted to one picture of it, rendered with four times the samples o
 methods see the same blurred differences and the same derivative by the camera (central differences,
 14 renders), coarse to fine; lights and material are known. A fit counts as converged if the
 rotation ends within 0.2 degrees and the eye within 0.5 % of its distance, which is a tenth of a
-pixel of these small pictures. Expected: nearly all
-starts converge with Levenberg-Marquardt, in a few hundred renders; Adam needs several times as
-many. Written to `--out`: `fit_robustness.json` with every start, `fit_robustness.png` with who
-converged from where and the renders used.
+pixel of these small pictures.
+
+Expected: all starts converge with Levenberg-Marquardt, in about 225 renders each. Adam takes all
+its steps, 1830 renders, and leaves about a quarter of the starts outside: nearly all of these have
+found the rotation, but creep along the valley in which distance and angle of view make up for each
+other. With `--degrees 90` Levenberg-Marquardt still brings 49 of 50 home; the other one, from 86
+degrees, ends far off.
+
+Written to `--out`: `fit_robustness.json` with every start, and `fit_robustness.png` with the final
+errors by the angle of the start and by the renders used.
 """
 
 import argparse
@@ -51,10 +57,12 @@ def levels_for(size: int, steps: int) -> list[Level]:
     return [Level(1, 4, size / 16, steps, False), Level(1, 4, 1.0, steps, True)]
 
 
-def random_camera(generator: np.random.Generator, truth: Start) -> tuple[dict[str, Any], float]:
-    """Return a camera up to 25 degrees and 15 % of the distance away, and the angle in degrees."""
+def random_camera(
+    generator: np.random.Generator, truth: Start, degrees: float
+) -> tuple[dict[str, Any], float]:
+    """Return a camera up to so many degrees and 15 % of the distance away, and the angle."""
     axis = generator.normal(size=3)
-    angle = np.radians(generator.uniform(0, 25))
+    angle = np.radians(generator.uniform(0, degrees))
     parameters = np.zeros(CAMERA_PARAMETERS, np.float32)
     parameters[:3] = angle * axis / np.linalg.norm(axis)
     parameters[5] = -np.log(generator.uniform(0.85, 1.15))
@@ -102,6 +110,7 @@ def run(
     *,
     starts: int = 50,
     size: int = 64,
+    degrees: float = 25.0,
     divisions: int = 8,
     adam_steps: int = 60,
     lm_steps: int = 20,
@@ -127,9 +136,12 @@ def run(
     true_start = start_of(mesh, truth)
     rows = []
     for number in range(starts):
-        camera, angle = random_camera(generator, true_start)
+        camera, angle = random_camera(generator, true_start, degrees)
         start = start_of(mesh, dataclasses.replace(truth, camera=camera))
-        row = {"angle_degrees": angle, "at_start": camera_errors(camera, truth.camera)}
+        row: dict[str, Any] = {
+            "angle_degrees": angle,
+            "at_start": camera_errors(camera, truth.camera),
+        }
         row |= {name: _outcome(start, fit, truth) for name, fit in methods.items()}
         rows.append(row)
         if progress:
@@ -138,6 +150,7 @@ def run(
     report = {
         "criterion": CRITERION,
         "size": size,
+        "degrees": degrees,
         "seed": seed,
         "methods": {name: _statistics([row[name] for row in rows]) for name in methods},
         "seconds": time.perf_counter() - started,
@@ -174,17 +187,17 @@ def plot_outcomes(path: Path, rows: list[dict[str, Any]], methods: list[str]) ->
     plt = pyplot()
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
     for name in methods:
-        errors = [max(row[name]["rotation_degrees"], 1e-4) for row in rows]
+        errors = [row[name]["eye_percent"] for row in rows]
         for axis, values in (
             (axes[0], [row["angle_degrees"] for row in rows]),
             (axes[1], [row[name]["renders"] for row in rows]),
         ):
             axis.semilogy(values, errors, "o", alpha=0.6, label=name.replace("_", "-"))
     for axis, label in zip(axes, ("angle of the start (degrees)", "renders"), strict=True):
-        axis.axhline(CRITERION["rotation_degrees"], color="0.6", zorder=0)
+        axis.axhline(CRITERION["eye_percent"], color="0.6", zorder=0)
         axis.set_xlabel(label)
     axes[1].set_xscale("log")
-    axes[0].set_ylabel("rotation error at the end (degrees)")
+    axes[0].set_ylabel("eye error at the end (% of its distance)")
     axes[0].legend()
     figure.savefig(path, dpi=120)
     plt.close(figure)
@@ -197,6 +210,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/fit_robustness"))
     parser.add_argument("--starts", type=int, default=50)
     parser.add_argument("--size", type=int, default=64, help="rows and columns of the pictures")
+    parser.add_argument("--degrees", type=float, default=25.0, help="turn the starts by up to")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())

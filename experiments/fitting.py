@@ -144,7 +144,6 @@ class Fit:
         renders: pictures rendered, those of differences included.
         derivatives: forward derivative passes by lights and material.
         seconds: wall-clock time, compilation included.
-        covariance: of the parameters, from the last level.
     """
 
     params: Params
@@ -153,7 +152,6 @@ class Fit:
     renders: int
     derivatives: int
     seconds: float
-    covariance: np.ndarray
 
 
 class Patience:
@@ -206,7 +204,10 @@ def fit(
         for step, (loss, at) in enumerate(
             zip(result.history.loss, result.history.params, strict=True)
         ):
-            entry = {"level": number, "renders": renders + (step + 1) * per_evaluation}
+            entry: dict[str, float] = {
+                "level": number,
+                "renders": renders + (step + 1) * per_evaluation,
+            }
             entry["residual"] = math.sqrt(2 * loss * level.shrink**2 / problem.target.size)
             if problem.truth is not None:
                 entry |= view_errors(view_of(start, at), problem.truth, float(start.size))
@@ -221,7 +222,6 @@ def fit(
         renders=renders,
         derivatives=derivatives,
         seconds=time.perf_counter() - started,
-        covariance=result.covariance,
     )
 
 
@@ -295,7 +295,7 @@ def plot_convergence(path: Path, trace: list[dict[str, float]]) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     renders = [entry["renders"] for entry in trace]
     axes[0].semilogy(renders, [entry["residual"] for entry in trace], ".-")
-    axes[0].set_ylabel("root mean square of the blurred difference (linear RGB)")
+    axes[0].set_ylabel("RMS of the blurred difference")
     for name in _errors_of(trace[0]):
         values = np.array([entry[name] for entry in trace])
         if values.any():

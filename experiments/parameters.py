@@ -177,8 +177,8 @@ def view_errors(view: View, truth: View, size: float) -> dict[str, float]:
     errors = camera_errors(view.camera, truth.camera)
     for i, (light, true) in enumerate(zip(view.lights, truth.lights, strict=True)):
         if isinstance(light, dr.DirectionalLight):
-            units = [np.asarray(dr.linalg.normalize(item.direction)) for item in (light, true)]
-            angle = 2 * np.arcsin(min(np.linalg.norm(units[0] - units[1]) / 2, 1.0))
+            units = [dr.linalg.normalize(item.direction) for item in (light, true)]
+            angle = 2 * np.arcsin(min(float(jnp.linalg.norm(units[0] - units[1])) / 2, 1.0))
             errors[f"light_{i}_degrees"] = float(np.degrees(angle))
         else:
             offset = np.linalg.norm(light.position - true.position)
@@ -188,7 +188,7 @@ def view_errors(view: View, truth: View, size: float) -> dict[str, float]:
             if own is not None and other is not None:
                 difference = getattr(light, kind) * own - getattr(true, kind) * other
                 errors[f"light_{i}_{kind}"] = float(jnp.max(jnp.abs(difference)))
-    if view.material.specular is not None:
+    if view.material.specular is not None and truth.material.specular is not None:
         errors["shininess_percent"] = float(
             100 * abs(view.material.shininess / truth.material.shininess - 1)
         )

@@ -160,10 +160,9 @@ class Oracle:
         firsts = np.cumsum([0, *(len(positions) for positions, _, _ in meshes)])
         self.positions = np.concatenate([positions for positions, _, _ in meshes])
         self.normals = np.concatenate([normals for _, normals, _ in meshes])
-        faces = [
-            faces + first for (_, _, faces), first in zip(meshes, firsts[:-1], strict=True)
-        ]
+        faces = [faces + first for (_, _, faces), first in zip(meshes, firsts[:-1], strict=True)]
         self.faces = np.concatenate(faces)
+        self.lights = self._lights()
         self.object_of_face = np.repeat(np.arange(len(faces)), [len(part) for part in faces])
 
     def material(self):
@@ -178,7 +177,7 @@ class Oracle:
         }
         return {k: np.asarray(values, float)[self.object_of_face] for k, values in table.items()}
 
-    def lights(self):
+    def _lights(self):
         kinds = {dr.DirectionalLight: "directional", dr.PointLight: "point"}
         lights = []
         for light in self.scene.lights:
@@ -196,7 +195,7 @@ class Oracle:
 
     def image(self, settings, samples=1):
         """The picture; "unlit" is what white ambient light makes of the diffuse reflectance."""
-        material, lights, shading = self.material(), self.lights(), settings.shading
+        material, lights, shading = self.material(), self.lights, settings.shading
         if shading == "unlit":
             material["ambient"] = material["diffuse"]
             lights, shading = [{"type": "ambient", "ambient": np.ones(3)}], "phong"

@@ -1,0 +1,108 @@
+"""The package reads in one direction: a module imports only what stands above it in `ORDER`."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import diffrast
+
+ROOT = Path(diffrast.__file__).parent
+ORDER = [
+    "diffrast._pytree",
+    "diffrast._check",
+    "diffrast._tokens",
+    "diffrast._compensated",
+    "diffrast.linalg",
+    "diffrast.color",
+    "diffrast.viewing",
+    "diffrast.opencv",
+    "diffrast.camera",
+    "diffrast._topology",
+    "diffrast.mesh",
+    "diffrast.shapes._grid",
+    "diffrast.shapes.solids",
+    "diffrast.shapes.curved",
+    "diffrast.shapes.bezier",
+    "diffrast.shapes.teapot",
+    "diffrast.shapes",
+    "diffrast.files._mesh_text",
+    "diffrast.files.meshes",
+    "diffrast.files.images",
+    "diffrast.files.bezier",
+    "diffrast.files",
+    "diffrast._stored",
+    "diffrast.raster.fixed_point",
+    "diffrast.raster.edge_functions",
+    "diffrast.raster.coverage",
+    "diffrast.raster.fragments",
+    "diffrast.raster",
+    "diffrast.interpolate",
+    "diffrast.material",
+    "diffrast.light",
+    "diffrast.shade",
+    "diffrast.render",
+    "diffrast._fit_result",
+    "diffrast._least_squares",
+    "diffrast._scale_space",
+    "diffrast.fit",
+    "diffrast",
+]
+
+
+def module_name(file):
+    parts = file.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(file): file for file in ROOT.rglob("*.py")}
+
+
+def imported_modules(file):
+    """Names of the package's modules that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file.name}: relative import in line {node.lineno}"
+            parts = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [part if part in MODULES else node.module for part in parts]
+        else:
+            continue
+        yield from (name for name in names if name.split(".")[0] == "diffrast")
+
+
+def test_every_module_has_its_place():
+    assert sorted(ORDER) == sorted(MODULES)
+
+
+@pytest.mark.parametrize("module", ORDER)
+def test_imports_go_one_way(module):
+    above = ORDER[: ORDER.index(module)]
+    assert set(imported_modules(MODULES[module])) <= set(above)
+
+
+def run_python(code, **environment):
+    environment = os.environ | {"PYTHONPATH": str(ROOT.parent)} | environment
+    command = [sys.executable, "-W", "error", "-c", code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.split()
+
+
+def test_import_needs_no_optional_package():
+    loaded = run_python("import sys, diffrast; print(*sys.modules)")
+    assert "diffrast.render" in loaded
+    assert not {"trimesh", "matplotlib", "tqdm", "scipy", "pytest"} & set(loaded)
+
+
+def test_import_makes_no_arrays():
+    # On a platform that does not exist, the first array is an error.
+    no_arrays = "import diffrast"
+    one_array = "import jax.numpy; jax.numpy.zeros(1)"
+    assert run_python(f"{no_arrays}; print('ok')", JAX_PLATFORMS="no_such_platform") == ["ok"]
+    with pytest.raises(AssertionError, match="no_such_platform"):
+        run_python(one_array, JAX_PLATFORMS="no_such_platform")
