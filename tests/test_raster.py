@@ -131,13 +131,16 @@ def test_culled_faces_are_those_of_the_oracle():
     assert np.all(draw(inside, faces, True).face == -1)
 
 
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 2), (4, 4096)])
-def test_images_of_odd_sizes(height, width):
-    rng = np.random.default_rng(height)
-    positions_clip = rng.normal(size=(60, 4)).astype(np.float32)
+@pytest.mark.parametrize(
+    ("function", "height", "width"),
+    [(compiled, 1, 1), (rasterize, 3, 2), (compiled, 4, 4096)],
+    ids=["one pixel", "3 x 2, not compiled", "4 x 4096"],
+)
+def test_images_of_odd_sizes(function, height, width):
+    positions_clip = np.random.default_rng(1).normal(size=(60, 4)).astype(np.float32)
     faces = np.arange(60).reshape(-1, 3)
     truth = reference.rasterize(positions_clip, faces, height, width)
-    fragments = rasterize(positions_clip, faces, height=height, width=width)
+    fragments = function(positions_clip, faces, height=height, width=width)
     assert_agrees(fragments, truth, positions_clip, faces)
 
 
@@ -187,20 +190,6 @@ def test_order_of_faces_and_repetition_change_nothing(name):
     order = np.random.default_rng(1).permutation(len(faces))
     shuffled = draw(positions_clip, faces[order])
     assert_same(once, renumbered(shuffled, order))
-
-
-def test_views_are_batched_by_vmap():
-    positions, faces = soup(300, 0.28)
-    eyes = [(0, 0, 4), (0.1, 0.2, 0.3), (-3, 1, 0)]
-    clips = np.stack([world_to_clip(perspective(eye, (0, 0.1, 0)), positions) for eye in eyes])
-    batch = jax.jit(
-        jax.vmap(lambda clip: rasterize(clip, faces, height=HEIGHT, width=WIDTH)),
-    )(clips)
-    for view, clip in enumerate(clips):
-        single = draw(clip, faces)
-        np.testing.assert_array_equal(batch.face[view], single.face)
-        np.testing.assert_allclose(batch.barycentrics[view], single.barycentrics, atol=1e-5)
-        np.testing.assert_allclose(batch.inverse_depth[view], single.inverse_depth, rtol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e-10, 1e15])

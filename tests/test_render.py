@@ -78,7 +78,7 @@ def test_culling_drops_the_inside_of_open_objects_only():
     truth = scenes.oracle(scene, camera)
     seen = [truth.fragments(cull_backfaces=cull).face for cull in (False, True)]
     dropped = seen[0] != seen[1]
-    assert 20 < dropped.sum()
+    assert dropped.sum() > 20
     assert np.all(truth.object_of_face[seen[0][dropped]] == 2)
 
 

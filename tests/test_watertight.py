@@ -171,11 +171,16 @@ def test_single_faces_own_what_exact_arithmetic_says():
     steps = np.repeat([1, 1, 4, 1024], count // 4)[:, None, None]
     pixels = 8.5 + rng.integers(-10 * steps, 10 * steps + 1, (count, 3, 2)) / steps
     clip = clip_from_pixels(pixels, 2.0 ** rng.integers(-2, 3, (count, 3, 1)), size)
-    clip = clip.reshape(-1, 4).astype(np.float32)
-    faces = np.arange(3 * count).reshape(-1, 3)
-    alone = jax.jit(jax.vmap(lambda face: rasterize(clip, face[None], height=size, width=size)))
-    owned = np.asarray(alone(faces).face) == 0
-    np.testing.assert_array_equal(owned, reference.exact_owned(clip, faces, size, size))
-    on_outline = reference.exact_location(clip, faces, size, size) == 0
+    clip = clip.astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def alone(corners):
+        return rasterize(corners, np.arange(3)[None], height=size, width=size).face == 0
+
+    owned = np.asarray(alone(clip))
+    every = clip.reshape(-1, 4), np.arange(3 * count).reshape(-1, 3), size, size
+    np.testing.assert_array_equal(owned, reference.exact_owned(*every))
+    on_outline = reference.exact_location(*every) == 0
     assert np.sum(on_outline) > 100
     assert 0.1 < np.mean(owned[on_outline]) < 0.9
