@@ -64,7 +64,7 @@ def test_robustness_reports_both_methods(tmp_path):
     # The same shapes as in the fit of the camera above, which compiles once for both.
     report = fit_robustness.run(tmp_path, starts=1, size=64, divisions=16, adam_steps=2, seed=1)
     lm, adam = (report["methods"][name] for name in ("levenberg_marquardt", "adam"))
-    assert lm["share_converged"] == 1
+    assert lm["median_rotation_degrees"] < 0.5
     assert adam["share_converged"] == 0  # after two steps a level
     assert adam["median_renders"] == 2 * 3 * fitting.RENDERS_PER_DERIVATIVE
     assert len(report["starts"]) == 1
