@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from diffrast._check import ArrayInput, float_array, index_array
 from diffrast._stored import assemble
 from diffrast.raster import Fragments
+from diffrast.raster.fragments import corners_at
 
 
 def interpolate(
@@ -47,7 +48,6 @@ def interpolate_columns(
     barycentrics: list[Float[Array, "height width"]],
 ) -> list[Float[Array, "height width"]]:
     """Interpolate attributes kept apart, which XLA fuses far better than stacked ones."""
-    corners = faces[jnp.maximum(face, 0)]
     b0, b1, b2 = barycentrics
-    i0, i1, i2 = (corners[..., j] for j in range(3))
+    i0, i1, i2 = corners_at(faces, face)
     return [b0 * column[i0] + b1 * column[i1] + b2 * column[i2] for column in columns]

@@ -5,7 +5,8 @@ sorts faces into tiles: a block of pixels stays in the first cache level, nothin
 work list has a capacity. The loops are `lax` loops, compiled, over vectorised blocks:
 
 * faces of up to 24×32 pixels: one block each, of the smallest size in `BLOCKS` that holds it;
-* large faces: rows of blocks, each row only as wide as the edges leave it;
+* large faces: rows of tiles, each row only as wide as the edges leave it, without the tiles that
+  are known to be hidden by what is drawn already;
 * wide faces (see `fixed_point`): the same sweep with edges from homogeneous coordinates, and the
   near and far plane tested at every pixel.
 
@@ -15,6 +16,7 @@ updates both; the id is kept as the bits of a normal float.
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +24,9 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast.raster.edge_functions import (
-    Corner,
+    Edge,
     Image,
+    Plane,
     Sweep,
     bias,
     corners_of,
@@ -49,9 +52,11 @@ from diffrast.raster.fixed_point import (
     subpixel_bits,
 )
 
-SWEEP_BLOCK = (32, 32)
-SWEEP_CHUNK = 128
-_MARGIN = tuple(max(sizes) for sizes in zip(SWEEP_BLOCK, *BLOCKS, strict=True))
+TILE = (32, 32)  # powers of two, for the larger faces
+CHUNK = 128
+_MARGIN = tuple(max(sizes) for sizes in zip(TILE, *BLOCKS, strict=True))
+_END = (1 << 31) - 1  # no tile
+_ROUNDINGS = 4  # of a key and its bound over a tile, which may differ
 
 
 @partial(jax.jit, static_argnames=("height", "width", "cull_backfaces"))
@@ -197,69 +202,128 @@ def _draw_sweeps(
     order: Array,
     span: tuple[Array, Array],
     image: Image,
-    set_up: Callable[[list[Corner], Image], Sweep],
+    set_up: Callable[[Vertices, Image], Sweep],
 ) -> Array:
-    """Draw faces of any size: rows of blocks, each as wide as the edges leave it.
+    """Draw faces of any size: rows of tiles, each as wide as the edges leave it.
 
-    Faces are set up a chunk at a time, vectorised; one flat loop then draws the chunk's blocks. Its
-    state is the face and the block's row and column, where -1 stands for the first.
+    Faces are set up a chunk at a time, vectorised; a flat loop then walks over the chunk's tiles.
+    The smallest key of each tile is kept, and tiles that hide the face are passed over.
     """
-    block_height, block_width = SWEEP_BLOCK
-    columns, rows = _pixel_grid(SWEEP_BLOCK)
+    columns, rows = _pixel_grid(TILE)
+    lowest_keys = jnp.full(_tile_counts(image), -jnp.inf, buffer.real.dtype) + buffer.real[0, 0] * 0
     first, stop = span
 
-    def draw_chunk(n: Array, buffer: Array) -> Array:
-        start = first + n * SWEEP_CHUNK
-        slots = jnp.minimum(start + jnp.arange(SWEEP_CHUNK), order.shape[0] - 1)
-        chunk = order[slots]
+    def draw_chunk(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        start = first + n * CHUNK
+        slots = start + jnp.arange(CHUNK)
+        chunk = order[jnp.minimum(slots, order.shape[0] - 1)]
         sweeps = set_up(corners_of(vertices, faces, chunk), image)
+        walk = _plan_walk(sweeps, slots < stop, image)
 
-        def draw(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-            i, row, column, buffer = state
-            sweep = jax.tree.map(lambda values: values[..., i], sweeps)
-            row = jnp.where(row < 0, sweep.rows[0], row)
-            left, right = _row_extent(sweep, row)
-            column = jnp.where(column < 0, left, column)
+        def hidden(tile: Array, lowest_keys: Array) -> Array:
+            i, tile_row, tile_column = _tile_place(tile, image)
+            key = Plane(*(member[0, i] for member in sweeps.planes))
+            corner = evaluate(key, tile_column * TILE[1], tile_row * TILE[0], 0, 0)
+            nearest = corner + sum(
+                jnp.maximum(slope * (size - 1), 0)
+                for slope, size in ((key.dx, TILE[1]), (key.dy, TILE[0]))
+            )
+            nearest = jnp.clip(nearest, *(bound[i] for bound in sweeps.key_range))
+            nearest = nearest + jnp.abs(nearest) * (_ROUNDINGS * jnp.finfo(nearest.dtype).eps)
+            return nearest <= lowest_keys[tile_row, tile_column]
 
+        def draw(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            tile, buffer, lowest_keys = state
+            i, tile_row, tile_column = _tile_place(tile, image)
+            row, column = tile_row * TILE[0], tile_column * TILE[1]
+            sweep = jax.tree.map(lambda member: member[..., i], sweeps)
             outside = jnp.zeros((), jnp.int32)
             for edge in each_edge(sweep.edges):
                 value = edge_value(edge, column, row)
                 outside = outside | (value + edge.a * columns + edge.b * rows)
-            inside = outside >= 0
-            key = jnp.clip(evaluate(sweep.key, column, row, columns, rows), *sweep.key_range)
-            for plane in sweep.limits:
-                inside = inside & (evaluate(plane, column, row, columns, rows) >= 0)
-            buffer = _resolve(buffer, (row, column), inside, key, chunk[i])
-
-            more_columns = column + block_width <= right
-            more_rows = row + block_height <= sweep.rows[1]
-            return (
-                jnp.where(more_columns | more_rows, i, i + 1),
-                jnp.where(more_columns, row, jnp.where(more_rows, row + block_height, -1)),
-                jnp.where(more_columns, column + block_width, -1),
-                buffer,
+            key, *limits = (
+                evaluate(Plane(*plane), column, row, columns, rows)
+                for plane in zip(*sweep.planes, strict=True)
             )
+            key = jnp.clip(key, *sweep.key_range)
+            inside = outside >= 0
+            for limit in limits:
+                inside = inside & (limit >= 0)
+            buffer = _resolve(buffer, (row, column), inside, key, chunk[i])
+            lowest = _smallest(lax.dynamic_slice(buffer, (row, column), TILE).real)
+            lowest_keys = lowest_keys.at[tile_row, tile_column].set(lowest)
+            tile = lax.while_loop(
+                lambda tile: (tile < _END) & hidden(tile, lowest_keys), walk.after, walk.after(tile)
+            )
+            return tile, buffer, lowest_keys
 
-        zero = stop & 0
-        state = (zero, zero - 1, zero - 1, buffer)
-        count = jnp.minimum(stop - start, SWEEP_CHUNK)
-        return lax.while_loop(lambda s: s[0] < count, draw, state)[3]
+        return lax.while_loop(lambda s: s[0] < _END, draw, (walk.first, *state))[1:]
 
-    return lax.fori_loop(0, (stop - first + SWEEP_CHUNK - 1) // SWEEP_CHUNK, draw_chunk, buffer)
+    chunks = (stop - first + CHUNK - 1) // CHUNK
+    return lax.fori_loop(0, chunks, draw_chunk, (buffer, lowest_keys))[0]
 
 
-def _row_extent(sweep: Sweep, row: Array) -> tuple[Array, Array]:
-    """First and last column that the edges may leave inside a row of blocks."""
-    dtype = sweep.edges.anchor_x.dtype
-    first, last = sweep.columns[0].astype(dtype), sweep.columns[1].astype(dtype)
+def _smallest(block: Array) -> Array:
+    """Minimum over a block, halved row by row, which XLA vectorises as it does no reduction."""
+    while block.shape[0] > 1:
+        half = block.shape[0] // 2
+        block = jnp.minimum(block[:half], block[half:])
+    return jnp.min(block)
+
+
+def _tile_counts(image: Image) -> tuple[int, int]:
+    """Tiles along rows and columns, in powers of two."""
+
+    def count(size: int, tile: int) -> int:
+        return 1 << (-(-size // tile) - 1).bit_length()
+
+    return count(image.height, TILE[0]), count(image.width, TILE[1])
+
+
+def _tile_place(tile: Array, image: Image) -> tuple[Array, Array, Array]:
+    """Face in the chunk, row and column of tiles."""
+    rows, columns = _tile_counts(image)
+    return tile // (rows * columns), tile // columns % rows, tile % columns
+
+
+class _Walk(NamedTuple):
+    """The tiles of a chunk's faces: one number a tile, counted by face, row and column of tiles."""
+
+    first: Array
+    last_in_row: Array
+    first_of_next: Array
+    columns: int
+
+    def after(self, tile: Array) -> Array:
+        row = tile // self.columns
+        return jnp.where(tile < self.last_in_row[row], tile + 1, self.first_of_next[row])
+
+
+def _plan_walk(sweeps: Sweep, drawn: Array, image: Image) -> _Walk:
+    """Which tiles of each row of tiles the edges may leave inside."""
+    dtype = sweeps.edges.anchor_x.dtype
+    tile_rows, tile_columns = _tile_counts(image)
+    row = jnp.arange(tile_rows) * TILE[0]
+    first = sweeps.columns[0].astype(dtype)[:, None]
+    last = sweeps.columns[1].astype(dtype)[:, None]
     left, right = first, last
-    for edge in each_edge(sweep.edges):
-        a, b = edge.a.astype(dtype), edge.b.astype(dtype)
+    for edge in each_edge(sweeps.edges):
+        edge = Edge(*(column[:, None] for column in edge))
         # Where the edge crosses zero in its best row of the band, with a pixel of slack.
-        y = row.astype(dtype) + jnp.where(b > 0, SWEEP_BLOCK[0] - 1, 0) - edge.anchor_y
+        y = row.astype(dtype) + jnp.where(edge.b > 0, TILE[0] - 1, 0) - edge.anchor_y
         crossing = edge.anchor_x + edge.run * y
-        left = jnp.maximum(left, jnp.where(a > 0, crossing - 1, first))
-        right = jnp.minimum(right, jnp.where(a < 0, crossing + 1, last))
-    left = jnp.clip(jnp.floor(left), first, last).astype(jnp.int32)
-    right = jnp.clip(jnp.ceil(right), first, last).astype(jnp.int32)
-    return left, right
+        left = jnp.maximum(left, jnp.where(edge.a > 0, crossing - 1, first))
+        right = jnp.minimum(right, jnp.where(edge.a < 0, crossing + 1, last))
+    used = (left <= right) & drawn[:, None]
+    used = used & (row + TILE[0] > sweeps.rows[0][:, None]) & (row <= sweeps.rows[1][:, None])
+    left = jnp.floor(jnp.clip(left, first, last)).astype(jnp.int32) // TILE[1]
+    right = jnp.ceil(jnp.clip(right, first, last)).astype(jnp.int32) // TILE[1]
+    start = jnp.arange(CHUNK * tile_rows) * tile_columns
+    first_tile = jnp.where(used.reshape(-1), start + left.reshape(-1), _END)
+    following = lax.cummin(first_tile, reverse=True)
+    return _Walk(
+        following[0],
+        start + right.reshape(-1),
+        jnp.concatenate([following[1:], jnp.full(1, _END, jnp.int32)]),
+        tile_columns,
+    )

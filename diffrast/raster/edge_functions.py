@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from diffrast._compensated import difference_of_products
 from diffrast.raster.fixed_point import (
@@ -37,32 +38,19 @@ class Image(NamedTuple):
     bits: int
 
 
-class Corner(NamedTuple):
-    """One row of `Vertices`."""
-
-    x_fixed: Array
-    y_fixed: Array
-    x: Array
-    y: Array
-    z: Array
-    w: Array
-    rank: Array
-    outcode: Array
+def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Vertices:
+    """Corners of faces; the first axis of every column is the corner of a face."""
+    corners = faces[chunk].T
+    return Vertices(*(column[corners] for column in vertices))
 
 
-def corners_of(vertices: Vertices, faces: Array, face: Array) -> list[Corner]:
-    """Gather the three corners of one face, or of an array of faces."""
-    return [Corner(*(column[faces[face, j]] for column in vertices)) for j in range(3)]
+def _edge_ends(corners: Vertices) -> tuple[Vertices, Vertices]:
+    """Start and end of the edge opposite to each corner."""
 
+    def rolled(shift: int) -> Vertices:
+        return Vertices(*(jnp.roll(column, -shift, axis=0) for column in corners))
 
-def _edge_ends(corners: list[Corner]) -> tuple[Corner, Corner]:
-    """Start and end of the edge opposite to each corner, on a new first axis."""
-
-    def stacked(order: tuple[int, int, int]) -> Corner:
-        columns = zip(*(corners[j] for j in order), strict=True)
-        return Corner(*(jnp.stack(column) for column in columns))
-
-    return stacked((1, 2, 0)), stacked((2, 0, 1))
+    return rolled(1), rolled(2)
 
 
 class Edge(NamedTuple):
@@ -87,12 +75,14 @@ class Plane(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Faces of any size, ready to be drawn; every member is a column, or one entry of it."""
+    """Faces of any size, ready to be drawn; faces lie along the last axis of every member.
+
+    The first plane is the depth key; any others are not negative between near and far.
+    """
 
     edges: Edge
-    key: Plane
+    planes: Plane
     key_range: tuple[Array, Array]
-    limits: tuple[Plane, ...]  # not negative where the face is between near and far
     columns: tuple[Array, Array]  # first and last
     rows: tuple[Array, Array]
 
@@ -116,9 +106,9 @@ def _anchored_edge(x: Array, y: Array, a: Array, b: Array, sign: Array, image: I
     return Edge(a, b, k, x / steps, y / steps, run)
 
 
-def set_up_large(corners: list[Corner], image: Image) -> Sweep:
+def set_up_large(corners: Vertices, image: Image) -> Sweep:
     """Regular vertices: exact edges, key affine on the screen."""
-    x_fixed, y_fixed = [c.x_fixed for c in corners], [c.y_fixed for c in corners]
+    x_fixed, y_fixed = list(corners.x_fixed), list(corners.y_fixed)
     sign = twice_area_sign(x_fixed, y_fixed)
     start, end = _edge_ends(corners)
     edges = _anchored_edge(
@@ -129,22 +119,21 @@ def set_up_large(corners: list[Corner], image: Image) -> Sweep:
         sign,
         image,
     )
-    inverse_w = [1 / c.w for c in corners]
-    x = [c.x * i for c, i in zip(corners, inverse_w, strict=True)]
-    y = [c.y * i for c, i in zip(corners, inverse_w, strict=True)]
-    values = [c.rank * i for c, i in zip(corners, inverse_w, strict=True)]
-    dx, dy = triangle_slopes(x, y, values)
+    inverse_w = 1 / corners.w
+    x, y = list(corners.x * inverse_w), list(corners.y * inverse_w)
+    keys = list(corners.rank * inverse_w)
+    dx, dy = triangle_slopes(x, y, keys)
+    key = Plane(keys[0], dx, dy, x[0] - (1 - image.width) / 2, y[0] - (1 - image.height) / 2)
     return Sweep(
         edges,
-        Plane(values[0], dx, dy, x[0] - (1 - image.width) / 2, y[0] - (1 - image.height) / 2),
-        (minimum3(values), maximum3(values)),
-        (),
+        Plane(*(column[None] for column in key)),
+        (minimum3(keys), maximum3(keys)),
         pixel_range(minimum3(x_fixed), maximum3(x_fixed), size=image.width, bits=image.bits),
         pixel_range(minimum3(y_fixed), maximum3(y_fixed), size=image.height, bits=image.bits),
     )
 
 
-def set_up_wide(corners: list[Corner], image: Image, *, cull_backfaces: bool) -> Sweep:
+def set_up_wide(corners: Vertices, image: Image, *, cull_backfaces: bool) -> Sweep:
     """Any vertices: edges as lines of homogeneous coordinates, near and far per pixel.
 
     e_i(p) = p · (v_j × v_k) is proportional to the barycentric coordinate i times 1/w, and an
@@ -152,51 +141,52 @@ def set_up_wide(corners: list[Corner], image: Image, *, cull_backfaces: bool) ->
     "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
     the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
     """
-    scale = maximum3([_largest([c.x, c.y, c.w]) for c in corners])
+    scale = maximum3(list(_largest([corners.x, corners.y, corners.w])))
     inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
-    points = [[v * inverse_scale for v in (c.x, c.y, c.w)] for c in corners]
-    normal = _cross(_minus(points[1], points[0]), _minus(points[2], points[0]))
-    determinant = sum(p * n for p, n in zip(points[0], normal, strict=True))
+    points = [column * inverse_scale for column in (corners.x, corners.y, corners.w)]
+    # (v_1 - v_0) × (v_2 - v_0), v_2 × v_0 and v_0 × v_1, for each the three components.
+    crosses = _cross(
+        [jnp.stack([c[1] - c[0], c[2], c[0]]) for c in points],
+        [jnp.stack([c[2] - c[0], c[0], c[1]]) for c in points],
+    )
+    determinant = sum(point[0] * cross[0] for point, cross in zip(points, crosses, strict=True))
     orientation = jnp.sign(determinant)
-
-    def plane(values: list[Array], factor: Array) -> Plane:
-        """`factor` times the numerator Σ e_i values_i, anchored at the image centre."""
-        second, third = _cross(points[2], points[0]), _cross(points[0], points[1])
-        vector = [
-            (values[0] * n + (values[1] - values[0]) * s + (values[2] - values[0]) * t) * factor
-            for n, s, t in zip(normal, second, third, strict=True)
-        ]
-        centre_x, centre_y = (jnp.full_like(scale, (n - 1) / 2) for n in image[1::-1])
-        return Plane(vector[2], vector[0], vector[1], centre_x, centre_y)
 
     size = jnp.abs(determinant) * scale
     inverse_size = jnp.where(size > 0, orientation / jnp.where(size > 0, size, 1), 0)
-    in_front = [c.w > 0 for c in corners]
-    ratios = [c.rank / jnp.where(f, c.w, 1) for c, f in zip(corners, in_front, strict=True)]
-    bounded = in_front[0] & in_front[1] & in_front[2]
+    # Numerators Σ e_i u_i of the key and of the distances from the near and the far plane.
+    depths = corners.z * inverse_scale
+    values = jnp.stack([corners.rank, points[2] + depths, points[2] - depths], axis=1)
+    factors = jnp.stack([inverse_size, orientation, orientation])
+    value_0, value_1, value_2 = values
+    dx, dy, value = (
+        (value_0 * cross[0] + (value_1 - value_0) * cross[1] + (value_2 - value_0) * cross[2])
+        * factors
+        for cross in crosses
+    )
+    centre_x, centre_y = (jnp.full_like(value, (n - 1) / 2) for n in (image.width, image.height))
+
+    in_front = corners.w > 0
+    ratios = list(corners.rank / jnp.where(in_front, corners.w, 1))
+    bounded = jnp.all(in_front, axis=0)
     infinite = jnp.asarray(jnp.inf, scale.dtype)
-    depths = [c.z * inverse_scale for c in corners]
     # y points down: a front face, counter-clockwise to the viewer, has a negative determinant.
     # With a sign of zero the edges leave nothing inside.
     drawn = (orientation < 0) if cull_backfaces else (orientation != 0)
     sign = jnp.where(drawn, orientation, 0).astype(jnp.int32)
     return Sweep(
         _homogeneous_edge(*_edge_ends(corners), sign, image),
-        plane([c.rank for c in corners], inverse_size),
+        Plane(value, dx, dy, centre_x, centre_y),
         (
             jnp.where(bounded, minimum3(ratios), -infinite),
             jnp.where(bounded, maximum3(ratios), infinite),
-        ),
-        (
-            plane([p[2] + d for p, d in zip(points, depths, strict=True)], orientation),
-            plane([p[2] - d for p, d in zip(points, depths, strict=True)], orientation),
         ),
         (jnp.zeros_like(sign), jnp.full_like(sign, image.width - 1)),
         (jnp.zeros_like(sign), jnp.where(drawn, image.height - 1, 0)),
     )
 
 
-def _homogeneous_edge(start: Corner, end: Corner, sign: Array, image: Image) -> Edge:
+def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image) -> Edge:
     """Integer edge of a wide face; it depends on its two end points alone.
 
     Between regular ends the edge is that of every other face. With one regular end it passes
@@ -208,8 +198,8 @@ def _homogeneous_edge(start: Corner, end: Corner, sign: Array, image: Image) -> 
     one, both = start_regular != end_regular, start_regular & end_regular
 
     # One regular end: direction towards the other, as the regular end sees it.
-    near = Corner(*(jnp.where(start_regular, s, e) for s, e in zip(start, end, strict=True)))
-    far = Corner(*(jnp.where(start_regular, e, s) for s, e in zip(start, end, strict=True)))
+    near = Vertices(*(jnp.where(start_regular, s, e) for s, e in zip(start, end, strict=True)))
+    far = Vertices(*(jnp.where(start_regular, e, s) for s, e in zip(start, end, strict=True)))
     inverse_w = 1 / jnp.where(one | both, near.w, 1)
     other = _unit_point(far)
     turn = jnp.where(start_regular, 1, -1)
@@ -255,7 +245,7 @@ def _homogeneous_edge(start: Corner, end: Corner, sign: Array, image: Image) -> 
     return edge._replace(k=jnp.where(one | both | crosses, edge.k, constant))
 
 
-def _unit_point(corner: Corner) -> list[Array]:
+def _unit_point(corner: Vertices) -> list[Array]:
     """Homogeneous pixel coordinates, scaled by their largest."""
     size = _largest([corner.x, corner.y, corner.w])
     inverse = 1 / jnp.where(size > 0, size, 1)
@@ -264,10 +254,6 @@ def _unit_point(corner: Corner) -> list[Array]:
 
 def _largest(values: list[Array]) -> Array:
     return maximum3([jnp.abs(v) for v in values])
-
-
-def _minus(a: list[Array], b: list[Array]) -> list[Array]:
-    return [x - y for x, y in zip(a, b, strict=True)]
 
 
 def _cross(a: list[Array], b: list[Array]) -> list[Array]:
@@ -297,7 +283,7 @@ def triangle_slopes(x: list[Array], y: list[Array], values: list[Array]) -> tupl
     return (v1 * y2 - v2 * y1) * scale, (v2 * x1 - v1 * x2) * scale
 
 
-def evaluate(plane: Plane, column: Array, row: Array, columns: Array, rows: Array) -> Array:
+def evaluate(plane: Plane, column: Array, row: Array, columns: ArrayLike, rows: ArrayLike) -> Array:
     """Value at each pixel of the block that begins at (column, row)."""
     dtype = plane.value.dtype
     x, y = column.astype(dtype) - plane.x, row.astype(dtype) - plane.y

@@ -33,16 +33,16 @@ def subpixel_bits(height: int, width: int) -> int:
 
 
 class Vertices(NamedTuple):
-    """What coverage needs to know of each vertex, as columns of length V."""
+    """What coverage needs to know of vertices, in columns: (V,), or (3, F) for corners of faces."""
 
-    x_fixed: Int[Array, " V"]  # grid steps right of the image centre; 0 if not regular
-    y_fixed: Int[Array, " V"]  # grid steps below the image centre
-    x: Float[Array, " V"]  # homogeneous pixel coordinates: x / w pixels right of the centre
-    y: Float[Array, " V"]
-    z: Float[Array, " V"]
-    w: Float[Array, " V"]
-    rank: Float[Array, " V"]  # numerator of the depth key: key = rank / w, larger is nearer
-    outcode: Int[Array, " V"]
+    x_fixed: Int[Array, "*V"]  # grid steps right of the image centre; 0 if not regular
+    y_fixed: Int[Array, "*V"]  # grid steps below the image centre
+    x: Float[Array, "*V"]  # homogeneous pixel coordinates: x / w pixels right of the centre
+    y: Float[Array, "*V"]
+    z: Float[Array, "*V"]
+    w: Float[Array, "*V"]
+    rank: Float[Array, "*V"]  # numerator of the depth key: key = rank / w, larger is nearer
+    outcode: Int[Array, "*V"]
 
 
 # Outcode bits. A face with one of the first seven bits common to its corners cannot be seen.

@@ -91,7 +91,7 @@ def evaluate_fragments(
     """Barycentric coordinates, one array a corner, and 1/w of given faces; 0 where face is -1."""
     height, width = face.shape
     covered = face >= 0
-    corners = faces[jnp.maximum(face, 0)]
+    corners = corners_at(faces, face)
     dtype = positions_clip.dtype
     # Pixel centres in half pixels from the image centre: integers, so products with half-length
     # factors are exact.
@@ -101,10 +101,9 @@ def evaluate_fragments(
 
     x, y, w = [], [], []
     for j in range(3):
-        corner = corners[..., j]
-        w_corner = w_vertex[corner]
-        x.append(_offset(x_vertex[corner], w_corner, width, x_centre))
-        y.append(_offset(y_vertex[corner], w_corner, height, y_centre))
+        w_corner = w_vertex[corners[j]]
+        x.append(_offset(x_vertex[corners[j]], w_corner, width, x_centre))
+        y.append(_offset(y_vertex[corners[j]], w_corner, height, y_centre))
         w.append(w_corner)
     edge = [
         x[1] * y[2] - x[2] * y[1],
@@ -119,6 +118,14 @@ def evaluate_fragments(
     positive = valid & (depth > 0)
     inverse_depth = jnp.where(positive, 1 / unit, 0) / jnp.where(positive, depth, 1)
     return barycentrics, inverse_depth
+
+
+def corners_at(
+    faces: Int[Array, "F 3"], face: Int[Array, "height width"]
+) -> list[Int[Array, "height width"]]:
+    """Vertices of the visible faces, one array a corner; those of face 0 on the background."""
+    visible = jnp.maximum(face, 0)
+    return [faces[:, j][visible] for j in range(3)]
 
 
 def _scaled_columns(positions_clip: Array) -> tuple[list[Array], Array]:
