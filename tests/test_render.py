@@ -364,7 +364,9 @@ def test_the_program_holds_only_what_the_scene_needs(case):
     if shading == "unlit" or names == ["ambient"]:
         assert times(counts, "sqrt") == 0
     # Nothing reads the texture coordinates.
-    assert not any(kind.endswith("x2xf32") for _, kind in counts)
+    assert not any(
+        kind.startswith((f"{VERTICES}x2x", f"{HEIGHT}x{WIDTH}x2x")) for _, kind in counts
+    )
 
 
 def test_a_gradient_in_lights_only_has_no_part_for_the_geometry():
