@@ -1,4 +1,4 @@
-"""Who touches whom in a mesh: welding, edges, polygons. Plain NumPy on the host, no derivatives.
+"""Who touches whom in a mesh: welding, edges, polygons. NumPy on the host, no derivatives.
 
 Topology is discrete and is made once per mesh, outside anything that JAX traces; `diffrast.mesh`
 checks the arguments, converts between JAX and NumPy, and is the public face of this file.
@@ -7,7 +7,9 @@ checks the arguments, converts between JAX and NumPy, and is the public face of 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 
@@ -25,6 +27,37 @@ class EdgeAdjacency(NamedTuple):
     edges: Int[np.ndarray, "edges 2"]
     edge_faces: Int[np.ndarray, "edges 2"]
     opposite: Int[np.ndarray, "edges 2"]
+
+
+class Edges(NamedTuple):
+    """Every edge once, as rasterising needs it; arrays of integers that JAX may trace.
+
+    Attributes:
+        faces: the two faces of each edge; −1 in second place where there is none.
+        corners: for each of the two faces, 3 i + j if the edge starts at its corner i and ends
+            at its corner j.
+        seam: whether the two faces have vertices of their own at the edge, so that attributes may
+            jump there.
+    """
+
+    faces: Int[Any, "edges 2"]
+    corners: Int[Any, "edges 2"]
+    seam: Bool[Any, "edges"]
+
+
+class Topology(NamedTuple):
+    """How the faces of a mesh hang together.
+
+    Attributes:
+        edges: every edge once.
+        neighbors: the faces across the three edges of each face, −1 where there is none.
+        patches: a number for each face, the same for faces that hang together by shared vertices,
+            over which attributes are continuous.
+    """
+
+    edges: Edges
+    neighbors: Int[Any, "faces 3"]
+    patches: Int[Any, "faces"]
 
 
 class HalfEdges(NamedTuple):
@@ -89,6 +122,91 @@ def edge_adjacency(positions: np.ndarray, faces: np.ndarray) -> EdgeAdjacency:
     )
     edges = half.corners[first, :2]
     return EdgeAdjacency(*(a.astype(np.int32) for a in (edges, edge_faces, opposite)))
+
+
+def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
+    """How a mesh hangs together, for rasterising."""
+    adjacency = edge_adjacency(positions, faces)
+    welded = representatives(positions)
+    ends = welded[adjacency.edges]
+    corners = []
+    for side in range(2):
+        at = welded[faces[np.maximum(adjacency.edge_faces[:, side], 0)]]
+        start, end = (np.argmax(at == ends[:, k : k + 1], axis=1) for k in range(2))
+        corners.append(3 * start + end)
+    packed = np.stack(corners, axis=1).astype(np.int32)
+    beyond = adjacency.edge_faces[:, 1]
+    other = faces[
+        np.maximum(beyond, 0)[:, None], np.stack([packed[:, 1] // 3, packed[:, 1] % 3], 1)
+    ]
+    seam = (beyond >= 0) & np.any(other != adjacency.edges, axis=1)
+    labels = np.arange(len(positions), dtype=np.int32)
+    while True:
+        before, labels = labels, labels.copy()
+        np.minimum.at(labels, faces, np.min(before[faces], axis=1)[:, None])
+        labels = labels[labels]
+        if np.array_equal(labels, before):
+            break
+    neighbors = np.full(faces.shape, -1, np.int32)
+    for side in range(2):
+        paired = beyond >= 0
+        sides = 3 - packed[paired, side] // 3 - packed[paired, side] % 3
+        neighbors[adjacency.edge_faces[paired, side], sides] = adjacency.edge_faces[
+            paired, 1 - side
+        ]
+    edges = Edges(adjacency.edge_faces, packed, seam)
+    return Topology(edges, neighbors, labels[faces[:, 0]])
+
+
+def traced_topology(positions: Array, faces: Array) -> Topology:
+    """How a mesh whose arrays are being traced hangs together: sorted in every call.
+
+    There are three edges a face; those that are not used have no faces. Where more than two faces
+    meet at an edge they pair in the order of their index.
+    """
+    welded = representatives(positions, jnp)[faces]
+    count = faces.shape[0]
+    start, end = welded.reshape(-1), jnp.roll(welded, -1, axis=1).reshape(-1)
+    proper = jnp.repeat(jnp.all(welded != jnp.roll(welded, 1, axis=1), axis=1), 3)
+    low, high = jnp.minimum(start, end), jnp.maximum(start, end)
+    low = jnp.where(proper, low, positions.shape[0])
+    order = jnp.lexsort((high, low))
+    low, high = low[order], high[order]
+    index = jnp.arange(3 * count)
+    begins = jnp.append(True, (low[1:] != low[:-1]) | (high[1:] != high[:-1]))
+    place = index - lax.cummax(jnp.where(begins, index, 0))
+    first = (place % 2 == 0) & proper[order]
+    following = jnp.minimum(index + 1, 3 * count - 1)
+    paired = first & ~begins[following] & (following > index)
+    one, other = order, order[following]
+    reverse = start[one] != start[other]
+    there, back = other % 3, (other % 3 + 1) % 3
+    opposite = jnp.where(reverse, 3 * back + there, 3 * there + back)
+    corner = 3 * (one % 3) + (one % 3 + 1) % 3
+    vertices = faces.reshape(-1)
+    ends = [vertices[3 * (one // 3) + c] for c in (corner // 3, corner % 3)]
+    others = [vertices[3 * (other // 3) + c] for c in (opposite // 3, opposite % 3)]
+    seam = paired & ((ends[0] != others[0]) | (ends[1] != others[1]))
+    columns = [jnp.where(first, one // 3, -1), jnp.where(paired, other // 3, -1)]
+
+    def join(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        labels, _ = state
+        joined = labels.at[faces].min(jnp.min(labels[faces], axis=1)[:, None])
+        return joined[joined], labels
+
+    labels = jnp.arange(positions.shape[0], dtype=jnp.int32) + 0 * faces[0, 0]
+    labels, _ = lax.while_loop(lambda s: jnp.any(s[0] != s[1]), join, (labels, labels - 1))
+    edges = Edges(
+        jnp.stack(columns, axis=1).astype(jnp.int32),
+        jnp.stack([corner, opposite], axis=1).astype(jnp.int32),
+        seam,
+    )
+    neighbors = jnp.full((count, 3), -1, jnp.int32)
+    for side in range(2):
+        sides = 3 - edges.corners[:, side] // 3 - edges.corners[:, side] % 3
+        own = jnp.where(paired, edges.faces[:, side], count)
+        neighbors = neighbors.at[own, sides].set(edges.faces[:, 1 - side], mode="drop")
+    return Topology(edges, neighbors, labels[faces[:, 0]])
 
 
 def _turns(

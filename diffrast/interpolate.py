@@ -44,9 +44,9 @@ def interpolate(
 def interpolate_columns(
     columns: list[Float[Array, " V"]],
     faces: Int[Array, "F 3"],
-    face: Int[Array, "height width"],
-    barycentrics: list[Float[Array, "height width"]],
-) -> list[Float[Array, "height width"]]:
+    face: Int[Array, "*size"],
+    barycentrics: list[Float[Array, "*size"]],
+) -> list[Float[Array, "*size"]]:
     """Interpolate attributes kept apart, which XLA fuses far better than stacked ones."""
     b0, b1, b2 = barycentrics
     i0, i1, i2 = corners_at(faces, face)

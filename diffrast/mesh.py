@@ -25,6 +25,7 @@ from diffrast import _check, _topology
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass, set_field
 from diffrast._topology import EdgeAdjacency as EdgeAdjacency
+from diffrast._topology import Topology as Topology
 from diffrast.linalg import dot, mirrors, norm, normalize, transform_normals, transform_points
 
 WEIGHTINGS = ("area", "angle", "uniform")
@@ -43,6 +44,10 @@ class Mesh:
         normals: unit vectors pointing out, or `None`; `with_normals` makes smooth ones, and
             `flat_shaded` those of the faces.
         uvs: texture coordinates, v upwards, or `None`.
+        topology: which faces meet where, found from the vertices and faces where they are known,
+            and kept by `dataclasses.replace(mesh, vertices=...)`; for other faces pass
+            `topology=None`. A mesh that is made of traced vertices has none: rendering it finds
+            it anew in every call.
 
     Raises:
         ValueError: for arrays of other shapes, numbers that are not finite, indices out of
@@ -53,6 +58,7 @@ class Mesh:
     faces: Int[Array, "faces 3"]
     normals: Float[Array, "vertices 3"] | None
     uvs: Float[Array, "vertices 2"] | None
+    topology: Topology | None
 
     def __init__(
         self,
@@ -61,6 +67,7 @@ class Mesh:
         faces: ArrayInput,
         normals: ArrayInput | None = None,
         uvs: ArrayInput | None = None,
+        topology: Topology | None = None,
     ) -> None:
         positions = _check.float_array("vertices", vertices, ("vertices", 3))
         count = positions.shape[0]
@@ -77,6 +84,8 @@ class Mesh:
         set_field(self, "faces", indices)
         set_field(self, "normals", normals)
         set_field(self, "uvs", uvs)
+        topology = _topology_of(positions, indices) if topology is None else topology
+        set_field(self, "topology", topology)
 
 
 def face_normals(vertices: ArrayInput, faces: ArrayInput) -> Float[Array, "faces 3"]:
@@ -143,7 +152,13 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
     _check.one_of("weighting", weighting, WEIGHTINGS)
     groups = jnp.asarray(_weld(mesh.vertices)) if weld else None
     normals = _vertex_normals(mesh.vertices, mesh.faces, groups, weighting)
-    return Mesh(vertices=mesh.vertices, faces=mesh.faces, normals=normals, uvs=mesh.uvs)
+    return Mesh(
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        normals=normals,
+        uvs=mesh.uvs,
+        topology=mesh.topology,
+    )
 
 
 _weld = weld  # `weld` is also the name of an option
@@ -327,6 +342,13 @@ def signed_volume(mesh: Mesh) -> Float[Array, ""]:
 def _arrays(vertices: ArrayInput, faces: ArrayInput) -> tuple[Array, Array]:
     positions = _check.float_array("vertices", vertices, ("vertices", 3))
     return positions, _check.index_array("faces", faces, ("faces", 3), bound=positions.shape[0])
+
+
+def _topology_of(vertices: Array, faces: Array) -> Topology | None:
+    if not (_check.is_concrete(vertices) and _check.is_concrete(faces)):
+        return None
+    topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces))
+    return jax.tree.map(jnp.asarray, topology)
 
 
 def _host_arrays(vertices: Array, faces: Array) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ only, and shades. What a scene does not hold is not computed: see `RenderSetting
 each stage.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -17,7 +18,9 @@ from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast._stored import assemble, stored, stored_rows
+from diffrast._topology import Edges, Topology, traced_topology
 from diffrast.camera import Camera, viewpoint, world_to_clip
+from diffrast.edges import Shader, View, antialias_image
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import (
     AmbientLight,
@@ -33,6 +36,8 @@ from diffrast.mesh import Mesh, face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
 from diffrast.raster.fragments import evaluate_fragments
 from diffrast.shade import Reflectance, Surface, needs, phong
+
+_SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
 
 SHADINGS = ("phong", "gouraud", "flat", "unlit")
 
@@ -119,6 +124,9 @@ class RenderSettings:
             normals of the faces, and "unlit" shows the diffuse reflectance without any light.
         cull_backfaces: drop faces whose corners turn clockwise to the viewer.
         samples: samples a pixel, a square number, on a regular grid, averaged with equal weights.
+        antialias: give edges their exact share of each sample's square, and the derivative its part
+            through what is visible where. Without it edges are jagged, and the derivative is that
+            of the shading alone.
     """
 
     height: int = static()
@@ -126,12 +134,14 @@ class RenderSettings:
     shading: str = static(default="phong")
     cull_backfaces: bool = static(default=False)
     samples: int = static(default=1)
+    antialias: bool = static(default=False)
 
     def __post_init__(self) -> None:
         set_field(self, "height", _check.positive_int("height", self.height))
         set_field(self, "width", _check.positive_int("width", self.width))
         _check.one_of("shading", self.shading, SHADINGS)
         set_field(self, "cull_backfaces", bool(self.cull_backfaces))
+        set_field(self, "antialias", bool(self.antialias))
         side = round(_check.positive_int("samples", self.samples) ** 0.5)
         if side * side != self.samples:
             raise ValueError(f"samples: wanted a square number, got {self.samples}")
@@ -165,9 +175,9 @@ def render(
 ) -> Float[Array, "height width 3"]:
     """Render one view.
 
-    Differentiable in every continuous part of the scene and the camera, for the faces that are
-    seen: the derivative of what is visible where (of silhouettes) is not part of it. Compiled at
-    the first call for each structure of the scene, image size and setting.
+    Differentiable in every continuous part of the scene and the camera; with `settings.antialias`
+    through the visibility of edges as well (`diffrast.edges`), the second derivatives of which are
+    left out. Compiled at the first call for each structure of the scene, image size and setting.
 
     Args:
         scene: what is seen.
@@ -193,14 +203,25 @@ def render(
     if not scene.objects:
         return jnp.broadcast_to(scene.background, (settings.height, settings.width, 3))
     geometry = _world_geometry(scene, settings.shading)
-    pixels = _visible(geometry, camera, height, width, settings.cull_backfaces)
+    clip = _clip_positions(geometry, camera)
+    size, seen_clip = (height, width), clip
+    if settings.antialias:  # a border of one pixel shows what lies beyond the edges there
+        size, seen_clip = (height + 2, width + 2), _with_border(clip, height, width)
+        if background.ndim == 3:
+            background = jnp.pad(background, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    pixels = _visible(geometry, seen_clip, *size, settings.cull_backfaces)
     with jax.named_scope("shade"):
         color = _SHADERS[settings.shading](scene, camera, geometry, pixels)
         covered = pixels.face >= 0
         color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
-        if side > 1:
-            color = [_box_average(channel, side) for channel in color]
-        return assemble(stored(color, geometry.faces))
+    if settings.antialias:
+        with jax.named_scope("edges"):
+            image = assemble(stored(color, geometry.faces))
+            image = _with_edges(image, scene, camera, geometry, clip, pixels, background, settings)
+            color = [image[..., c] for c in range(3)]
+    if side > 1:
+        color = [_box_average(channel, side) for channel in color]
+    return assemble(stored(color, geometry.faces))
 
 
 @jax.jit
@@ -215,7 +236,8 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         nothing = jnp.full(size, -1, jnp.int32)
         return Buffers(nothing, nothing, three, three[..., 0], three, three, None)
     geometry = _world_geometry(scene, settings.shading)
-    pixels = _visible(geometry, camera, *size, settings.cull_backfaces)
+    clip = _clip_positions(geometry, camera)
+    pixels = _visible(geometry, clip, *size, settings.cull_backfaces)
     if settings.shading == "flat" or geometry.normals is None:
         columns = _flat_normals(geometry, pixels.face)
     else:
@@ -254,9 +276,11 @@ class _Geometry(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    face: Int[Array, "height width"]
+    """Points on faces: the pixels of an image, or a row of them."""
+
+    face: Int[Array, "*size"]
     barycentrics: Columns
-    inverse_depth: Float[Array, "height width"]
+    inverse_depth: Float[Array, "*size"]
 
 
 def _world_geometry(scene: Scene, shading: str) -> _Geometry:
@@ -298,12 +322,19 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
         )
 
 
-def _visible(
-    geometry: _Geometry, camera: Camera, height: int, width: int, cull_backfaces: bool
-) -> _Pixels:
+def _clip_positions(geometry: _Geometry, camera: Camera) -> Float[Array, "V 4"]:
     with jax.named_scope("project"):
-        positions_clip = world_to_clip(camera, geometry.positions)
-        positions_clip = stored_rows(positions_clip, geometry.faces)
+        return stored_rows(world_to_clip(camera, geometry.positions), geometry.faces)
+
+
+def _with_border(positions_clip: Array, height: int, width: int) -> Array:
+    scale = np.array([width / (width + 2), height / (height + 2), 1, 1])
+    return positions_clip * scale.astype(positions_clip.dtype)
+
+
+def _visible(
+    geometry: _Geometry, positions_clip: Array, height: int, width: int, cull_backfaces: bool
+) -> _Pixels:
     with jax.named_scope("rasterize"):
         face = visible_faces(
             jax.lax.stop_gradient(positions_clip),
@@ -325,6 +356,89 @@ def _flat_normals(geometry: _Geometry, face: Array) -> Columns:
     normals = face_normals(geometry.positions, geometry.faces_outward)
     visible = jnp.maximum(face, 0)
     return [normals[:, i][visible] for i in range(3)]
+
+
+# Edges --------------------------------------------------------------------------------------------
+
+
+def _with_edges(
+    image: Array,
+    scene: Scene,
+    camera: Camera,
+    geometry: _Geometry,
+    positions_clip: Array,
+    pixels: _Pixels,
+    background: Array,
+    settings: RenderSettings,
+) -> Array:
+    topology = _scene_topology(scene, geometry)
+    if settings.shading == "flat":  # every face has a colour of its own
+        topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
+    view = View(
+        positions_clip=positions_clip,
+        faces=geometry.faces,
+        turned=geometry.faces_outward[:, 0] != geometry.faces[:, 0],
+        topology=topology,
+        apart=_apart(geometry, topology.edges, settings.shading),
+        face_image=pixels.face,
+        image=image,
+        background=background,
+        scene=(scene, camera, geometry),
+    )
+    return antialias_image(
+        view,
+        shader=_shade_points(settings.shading),
+        cull_backfaces=settings.cull_backfaces,
+    )
+
+
+def _shade_points(shading: str) -> Shader:
+    def shade(seen: tuple[Scene, Camera, _Geometry], face: Array, at: Columns) -> Columns:
+        scene, camera, geometry = seen
+        no_depth = jnp.zeros_like(at[0])
+        return _SHADERS[shading](scene, camera, geometry, _Pixels(face, at, no_depth))
+
+    return shade
+
+
+def _scene_topology(scene: Scene, geometry: _Geometry) -> Topology:
+    meshes = [item.mesh for item in scene.objects]
+    own = [
+        traced_topology(m.vertices, m.faces) if m.topology is None else m.topology for m in meshes
+    ]
+    first_faces = np.cumsum([0] + [m.faces.shape[0] for m in meshes])
+    first_vertices = np.cumsum([0] + [m.vertices.shape[0] for m in meshes])
+
+    def moved(faces: Array, by: int) -> Array:
+        return jnp.where(faces >= 0, faces + by, -1)
+
+    edges = [
+        part.edges._replace(faces=moved(part.edges.faces, int(first)))
+        for part, first in zip(own, first_faces, strict=False)
+    ]
+    return Topology(
+        Edges(*(jnp.concatenate(column) for column in zip(*edges, strict=True))),
+        jnp.concatenate(
+            [moved(t.neighbors, int(f)) for t, f in zip(own, first_faces, strict=False)]
+        ),
+        jnp.concatenate([t.patches + int(v) for t, v in zip(own, first_vertices, strict=False)]),
+    )
+
+
+def _apart(geometry: _Geometry, edges: Edges, shading: str) -> Array:
+    """Edges between two faces whose colours may differ there though both are seen."""
+    if shading == "flat":
+        return jnp.ones_like(edges.seam)
+    if geometry.normals is None:
+        return jnp.zeros_like(edges.seam)
+    differs = jnp.zeros_like(edges.seam)
+    for k in range(2):
+        corner = edges.corners // 3 if k == 0 else edges.corners % 3
+        vertex = [geometry.faces[jnp.maximum(edges.faces[:, i], 0), corner[:, i]] for i in range(2)]
+        one, other = (geometry.normals[v] for v in vertex)
+        largest = jnp.max(jnp.abs(one), axis=1) + jnp.max(jnp.abs(other), axis=1)
+        differs = differs | (jnp.max(jnp.abs(one - other), axis=1) > _SAME_NORMAL * largest)
+    return edges.seam & differs
 
 
 # Shading ------------------------------------------------------------------------------------------
@@ -366,12 +480,19 @@ def _shade_unlit(scene: Scene, camera: Camera, geometry: _Geometry, pixels: _Pix
     return [jnp.broadcast_to(channel, pixels.face.shape) for channel in diffuse]
 
 
-_SHADERS = {
+_SHADERS: dict[str, Callable[..., Columns]] = {
     "phong": _shade_phong,
     "gouraud": _shade_gouraud,
     "flat": _shade_flat,
     "unlit": _shade_unlit,
 }
+
+
+def _box_average(channel: Array, side: int) -> Array:
+    """Mean over side × side blocks, added in one fixed order."""
+    height, width = channel.shape
+    blocks = channel.reshape(height // side, side, width // side, side)
+    return blocks.mean(axis=(1, 3))
 
 
 def _to_viewer(camera: Camera, position: Columns | None) -> Columns:
@@ -407,10 +528,3 @@ def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
         else None,
         jnp.stack([m.shininess for m in materials])[which] if specular else None,
     )
-
-
-def _box_average(channel: Array, side: int) -> Array:
-    """Mean over side × side blocks, added in one fixed order."""
-    height, width = channel.shape
-    blocks = channel.reshape(height // side, side, width // side, side)
-    return blocks.mean(axis=(1, 3))

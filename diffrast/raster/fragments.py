@@ -120,9 +120,7 @@ def evaluate_fragments(
     return barycentrics, inverse_depth
 
 
-def corners_at(
-    faces: Int[Array, "F 3"], face: Int[Array, "height width"]
-) -> list[Int[Array, "height width"]]:
+def corners_at(faces: Int[Array, "F 3"], face: Int[Array, "*size"]) -> list[Int[Array, "*size"]]:
     """Vertices of the visible faces, one array a corner; those of face 0 on the background."""
     visible = jnp.maximum(face, 0)
     return [faces[:, j][visible] for j in range(3)]

@@ -1,0 +1,400 @@
+"""Exact areas of pixels beyond edges: the anti-aliased image and its derivative.
+
+A piece of an edge from y0 to y1, relative to its pixel's centre, parts off the area beyond it as
+the centre sees it; there the picture shows what is on the other side. With q the position of a
+direction along the unit square's perimeter, 0 to 4,
+
+    S = wrap(q(y1) - q(y0)) / 4 - (y0 × y1) / 2,    pixel += S (colour right - colour left),
+
+which adds up exactly over the pieces of any outline. To first order dS is minus the piece's normal
+times the motion of its middle: linear in the positions, without a singularity.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Int
+
+from diffrast._topology import Topology
+from diffrast.edges.pieces import (
+    EDGES_AT_ONCE,
+    PIECES_AT_ONCE,
+    Pieces,
+    Segments,
+    choose_edges,
+    clip_edges,
+    cut,
+    facing,
+    to_pixels,
+)
+from diffrast.edges.visibility import BACKGROUND, Seen, look
+
+_ROWS_AT_ONCE = 1024
+_NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
+
+Shader = Callable[[Any, Array, list[Array]], list[Array]]
+
+
+class View(NamedTuple):
+    """What is drawn, and the picture without edges; both pictures with a border of one pixel."""
+
+    positions_clip: Float[Array, "V 4"]  # of the view without its border
+    faces: Int[Array, "F 3"]
+    turned: Bool[Array, " F"] | None  # faces that count as turned round where back faces are culled
+    topology: Topology
+    apart: Bool[Array, " edges"]  # whether colours may jump across an edge that is no outline
+    face_image: Int[Array, "height_with_border width_with_border"]
+    image: Float[Array, "height_with_border width_with_border channels"]
+    background: Float[Array, "*size channels"]  # one colour, or a picture like `image`
+    scene: Any  # passed on to the shader
+
+
+class Method(NamedTuple):
+    """How edges are drawn; all static.
+
+    Attributes:
+        shader: colours of points on faces, `shader(scene, face, barycentrics)`; None takes the
+            colours of pixels beside the edge instead.
+        cull_backfaces: whether only front faces are drawn.
+        capacity: rows of the records.
+    """
+
+    shader: Shader | None
+    cull_backfaces: bool
+    capacity: int
+
+
+class Records(NamedTuple):
+    """Visible pieces, as many as there are rows; the first `total` are in use, or all."""
+
+    total: Int[Array, ""]  # number of visible pieces
+    integers: Int[Array, "capacity 6"]  # pixel, pixels of front, beyond, rim; start and end vertex
+    jump: Float[Array, "capacity channels"]  # of the colour outwards, as the piece moves
+    weights: Float[Array, "capacity 2"]  # area beyond as the pixel's centre sees it; rim's length
+    motion: Float[Array, "capacity 6"]  # of the area with x, y, w of start and end vertex
+
+
+class Blended(NamedTuple):
+    """What the pieces do to the picture."""
+
+    records: Records
+    added: Float[Array, "pixels channels"]
+    rims: Float[Array, " pixels_with_border"]  # length of smooth rims about a pixel's centre
+
+
+def perimeter(x: Array, y: Array) -> Array:
+    """Where the ray through (x, y) leaves the unit square, 0 to 4 along its perimeter."""
+    across, along = jnp.abs(x), jnp.abs(y)
+    largest = jnp.maximum(across, along)
+    inverse = 0.5 / jnp.where(largest > 0, largest, 1)
+    return jnp.where(
+        across >= along,
+        jnp.where(x >= 0, 0, 2) + jnp.where(x >= 0, y, -y) * inverse,
+        jnp.where(y > 0, 1, 3) + jnp.where(y > 0, -x, x) * inverse,
+    )
+
+
+def _area(begin: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
+    """Part of the pixel beyond a piece, positive if that is on the right."""
+    turn = perimeter(*end) - perimeter(*begin)
+    turn = turn - 4 * jnp.round(turn / 4)
+    return turn / 4 - (begin[0] * end[1] - begin[1] * end[0]) / 2
+
+
+def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> list[Array]:
+    """Derivative of the area by x, y, w of the edge's start and of its end."""
+    of = pieces.segment
+    normal = [seen.end[1] - seen.begin[1], seen.begin[0] - seen.end[0]]
+    shares = [1 - seen.middle, seen.middle]
+    columns = []
+    for vertex in range(2):
+        total = [jnp.zeros_like(seen.middle) for _ in range(3)]
+        for i, (x, y) in enumerate((segments.start, segments.end)):
+            s = segments.range[i][of]
+            factor = -shares[i] * segments.weights[i][of] * (s if vertex else 1 - s)
+            across, down = factor * normal[0], factor * normal[1]
+            total = [
+                total[0] + across,
+                total[1] + down,
+                total[2] - across * x[of] - down * y[of],
+            ]
+        columns += total
+    return columns
+
+
+def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
+    """Find the visible pieces, and the sum of what they add to the image.
+
+    `first` is the number of the visible piece from which on they are recorded.
+    """
+    image, scene, shader = view.image, view.scene, method.shader
+    height, width, channels = image.shape[0] - 2, image.shape[1] - 2, image.shape[2]
+    edges = view.topology.edges
+    pixels = to_pixels(view.positions_clip, height, width)
+    volume = facing(pixels, view.faces)
+    seen = volume != 0
+    if method.cull_backfaces:
+        seen = seen & ((volume < 0) if view.turned is None else (volume < 0) != view.turned)
+    order, edge_count = choose_edges(edges, volume, seen, view.apart)
+    flat = image.reshape(-1, channels)
+
+    def add_pieces(n: Array, total: Blended, segments: Segments, ends: Array) -> Blended:
+        pieces = cut(segments, ends, n * PIECES_AT_ONCE, height=height, width=width)
+        found = look(pieces, segments, view.faces, pixels, view.topology, seen, view.face_image)
+        rim = found.rim
+
+        def place(look: Array | int) -> Array:
+            return (pieces.row + look // 3) * (width + 2) + pieces.column + look % 3
+
+        def shade(*points: tuple[Array, list[Array]]) -> list[Array]:
+            assert shader is not None
+            face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
+            return jnp.split(jnp.stack(shader(scene, face, barycentrics), axis=-1), len(points))
+
+        places = [place(i) for i in (found.front.look, found.beyond.look, rim.inner)]
+        near, behind, inner = (flat[i] for i in places)
+        plain = view.background.ndim == 1
+        bare = view.background if plain else view.background.reshape(-1, channels)[place(4)]
+        behind = jnp.where((found.beyond.face == BACKGROUND)[:, None], bare, behind)
+        front = near
+        outward = jnp.where(found.front_on_right, -1, 1)
+        area = outward * _area(found.begin, found.end)
+        length = jnp.hypot(found.end[0] - found.begin[0], found.end[1] - found.begin[1])
+        smooth = jnp.zeros_like(found.visible)
+        if shader is None:
+            jump = behind - front
+            value = area[:, None] * jump
+        else:
+            front, beyond, bend, far = shade(found.front[:2], found.beyond[:2], rim.bend, rim.far)
+            behind = jnp.where(found.beyond.face[:, None] >= 0, beyond, behind)
+            smooth = rim.smooth
+            integral, moved = _along(found, front, bend, far, near, inner)
+            jump = behind - jnp.where(smooth[:, None], moved, front)
+            mean = integral - rim.depth[:, None] * near
+            value = jnp.where(
+                smooth[:, None],
+                area[:, None] * (behind - near) + length[:, None] * mean,
+                area[:, None] * jump,
+            )
+        size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
+        used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
+        pixel = jnp.where(used, pieces.row * width + pieces.column, 0)
+        added = total.added.at[pixel].add(jnp.where(used[:, None], value, 0))
+        rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
+        rims = total.rims.at[places[0]].add(rim_length)
+
+        records = total.records
+        slot = records.total + jnp.cumsum(used) - 1 - first
+        slot = jnp.where(used & (slot >= 0), slot, method.capacity)
+        start, end = (column[pieces.segment] for column in segments.vertices)
+        rows = (
+            jnp.stack([pixel, *places, start, end], axis=-1),
+            jump,
+            jnp.stack([area, rim_length], axis=-1),
+            outward[:, None] * jnp.stack(_motion(segments, pieces, found), axis=-1),
+        )
+        columns = (
+            old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
+        )
+        return Blended(Records(records.total + jnp.sum(used), *columns), added, rims)
+
+    def add_edges(n: Array, total: Blended) -> Blended:
+        slots = n * EDGES_AT_ONCE + jnp.arange(EDGES_AT_ONCE)
+        segments = clip_edges(
+            order[jnp.minimum(slots, order.shape[0] - 1)],
+            slots < edge_count,
+            edges,
+            view.faces,
+            pixels,
+            volume,
+            seen,
+            height=height,
+            width=width,
+        )
+        ends = jnp.cumsum(segments.parts)
+        chunks = (ends[-1] + PIECES_AT_ONCE - 1) // PIECES_AT_ONCE
+        return lax.fori_loop(
+            0, chunks, lambda i, total: add_pieces(i, total, segments, ends), total
+        )
+
+    zero, dtype, rows = edge_count & 0, image.dtype, method.capacity
+    records = Records(
+        zero,
+        jnp.zeros((rows, 6), jnp.int32) + zero,
+        jnp.zeros((rows, channels), dtype) + zero,
+        jnp.zeros((rows, 2), dtype) + zero,
+        jnp.zeros((rows, 6), dtype) + zero,
+    )
+    nothing = Blended(
+        records,
+        jnp.zeros((height * width, channels), dtype) + zero,
+        jnp.zeros((height + 2) * (width + 2), dtype) + zero,
+    )
+    chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
+    return lax.fori_loop(0, chunks, add_edges, nothing)
+
+
+def _along(
+    seen: Seen, front: Array, bend: Array, far: Array, near: Array, inner: Array
+) -> tuple[Array, Array]:
+    """The colour of a smooth surface from its rim to where the pixel ends.
+
+    Its integral over this depth; and the colour that counts as the rim moves. As a point at a
+    fixed depth keeps its colour, that is the one at the far end, less what the derivative of the
+    next pixel, which stands for this one's, says of it.
+    """
+    rim = seen.rim
+    first, depth, distance = (x[:, None] for x in (rim.first, rim.depth, rim.distance))
+    centre = jnp.clip(seen.centre_depth[:, None], first, depth)
+    bends = first < depth
+    far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
+    far = jnp.where(bends, far, bend)
+    rise = jnp.where(bends, depth * (inner - far) / (distance - depth), far - front)
+    # Seen from ever flatter above, it changes with the square root of the depth.
+    mean = jnp.where(rim.single, 1 / 2, 2 / 3)[:, None]
+    passes = centre > first
+    near = jnp.where(passes, near, bend)
+    integral = (
+        first * (front + bend) / 2
+        + (centre - first) * (bend + mean * (near - bend))
+        + (depth - centre) * (near + jnp.where(passes, 1 / 2, mean) * (far - near))
+    )
+    return integral, far - rise
+
+
+# The derivative -----------------------------------------------------------------------------------
+
+
+def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: Any) -> Any:
+    """Add up what each block of rows contributes; `used` masks the rows behind the last."""
+    rows_at_once = min(_ROWS_AT_ONCE, records.jump.shape[0])
+
+    def step(n: Array, total: Any) -> Any:
+        used = n * rows_at_once + jnp.arange(rows_at_once) < records.total
+        rows = [
+            lax.dynamic_slice_in_dim(column, n * rows_at_once, rows_at_once)
+            for column in records[1:]
+        ]
+        return add(used, rows, total)
+
+    rows = jnp.minimum(records.total, records.jump.shape[0])
+    return lax.fori_loop(0, (rows + rows_at_once - 1) // rows_at_once, step, start)
+
+
+def _over_rounds(
+    view: View, method: Method, records: Records, add: Callable[[Records, Any], Any], start: Any
+) -> Any:
+    """Add up over all visible pieces: over those recorded, and what else there is by and by."""
+
+    def another(n: Array, total: Any) -> Any:
+        more = collect(view, method, n * method.capacity).records
+        return add(more._replace(total=more.total - n * method.capacity), total)
+
+    rounds = (records.total + method.capacity - 1) // method.capacity
+    return lax.fori_loop(1, rounds, another, add(records, start))
+
+
+def _push(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array, added: Array
+) -> Array:
+    """Change of the image with the homogeneous pixel coordinates and with the hard image.
+
+    What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
+    at the next pixel inwards stands for it.
+    """
+    records, _, rims = blended
+
+    def average(used: Array, rows: Any, total: Array) -> Array:
+        integers, _, weights, _ = rows
+        _, front, _, inner, _, _ = integers.T
+        return total.at[front].add(jnp.where(used, weights[:, 1], 0)[:, None] * colors[inner])
+
+    def add(used: Array, rows: Any, total: Array) -> Array:
+        integers, jump, weights, motion = rows
+        pixel, front, beyond, _, start, end = integers.T
+        moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
+        value = moved[:, None] * jump + weights[:, :1] * (colors[beyond] - colors[front])
+        return total.at[pixel].add(jnp.where(used[:, None], value, 0))
+
+    if method.shader is not None:
+        sums = _over_rounds(
+            view, method, records, lambda r, t: _over_rows(r, average, t), jnp.zeros_like(colors)
+        )
+        rim = (rims > 0)[:, None]
+        colors = jnp.where(rim, sums / jnp.where(rim, rims[:, None], 1), colors)
+    added = added + _cropped(colors, view.image.shape)
+    return _over_rounds(view, method, records, lambda r, t: _over_rows(r, add, t), added)
+
+
+def _pull(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
+) -> tuple[Array, Array]:
+    """The transpose of `_push`, added to `points` and `colors`."""
+    records, _, rims = blended
+    own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
+    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
+
+    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        points, colors = total
+        integers, jump, weights, motion = rows
+        pixel, front, beyond, _, start, end = integers.T
+        value = jnp.where(used[:, None], cotangent[pixel], 0)
+        along = jnp.sum(value * jump, axis=1)[:, None]
+        points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
+        value = value * weights[:, :1]
+        return points, colors.at[beyond].add(value).at[front].add(-value)
+
+    points, own = _over_rounds(
+        view, method, records, lambda r, t: _over_rows(r, add, t), (points, own)
+    )
+    if method.shader is None:
+        return points, colors + own
+    rim = (rims > 0)[:, None]
+    sums = jnp.where(rim, own / jnp.where(rim, rims[:, None], 1), 0)
+    own = jnp.where(rim, 0, own)
+
+    def average(used: Array, rows: Any, total: Array) -> Array:
+        integers, _, weights, _ = rows
+        _, front, _, inner, _, _ = integers.T
+        return total.at[inner].add(jnp.where(used, weights[:, 1], 0)[:, None] * sums[front])
+
+    own = _over_rounds(view, method, records, lambda r, t: _over_rows(r, average, t), own)
+    return points, colors + own
+
+
+def _cropped(colors: Array, shape: tuple[int, ...]) -> Array:
+    return colors.reshape(shape)[1:-1, 1:-1].reshape(-1, shape[-1])
+
+
+def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
+    """Zeros that depend on a tangent: the system is to be linear in all parts of its right side."""
+    return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
+
+
+def apply_linear(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array
+) -> Array:
+    """`_push`, written as a linear system so that JAX knows both directions.
+
+    The system is triangular, (points, colors, out - push) = (points, colors, 0), and its solution
+    and that of its transpose are loops over as many pieces as there are.
+    """
+    one_by_one = jax.custom_batching.sequential_vmap
+
+    def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        return x
+
+    def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        push = one_by_one(lambda view, *rest: _push(view, method, *rest))
+        return b[0], b[1], push(view, blended, *b)
+
+    def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        pull = one_by_one(lambda view, *rest: _pull(view, method, *rest))
+        return *pull(view, blended, *b), b[2]
+
+    nothing = linear_zeros(_cropped(colors, view.image.shape).shape, colors)
+    return lax.custom_linear_solve(matvec, (points, colors, nothing), solve, transpose_solve)[2]

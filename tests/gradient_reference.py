@@ -1,0 +1,446 @@
+"""Reference derivatives of images under a box filter, and the scenes that they belong to.
+
+`reference_jacobian` differentiates `box_filter.render_box` by central differences, with one step
+of Richardson's extrapolation, for the 13 numbers that `moved` explains: camera and first object.
+Projections of the Jacobians on smooth random fields are stored in data/gradients.npz; running this
+file makes them again:
+
+    python tests/gradient_reference.py [--scenes cubes,sphere] [--size 96]
+    python tests/gradient_reference.py --check cubes
+
+For a scene NAME the file holds `NAME/projections` (16, 13), the sums over pixels and channels of
+`adjoint_fields` times the Jacobian; `NAME/target_image_params` (13,), a motion by 1.5 pixels or
+so; and `NAME/l2_gradient` (13,), the gradient at rest of half the sum of squared differences to
+the image after that motion.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from box_filter import render_box
+from reference import look_at, perspective
+
+import diffrast as dr
+
+STORE = Path(__file__).parent / "data" / "gradients.npz"
+PARAMETERS = 13
+GROUPS = {
+    "rotation": slice(0, 3),
+    "translation": slice(3, 6),
+    "fov": slice(6, 7),
+    "object rotation": slice(7, 10),
+    "object translation": slice(10, 13),
+}
+STEP = 0.1  # pixels
+SEED = 20240611
+
+
+@dataclass(frozen=True)
+class Object:
+    """A mesh in world space: vertices (V, 3), faces (F, 3), normals (V, 3); it turns about `pivot`.
+
+    `material` is a dict of RGB "ambient", "diffuse", "specular" and "shininess".
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    material: dict
+    pivot: np.ndarray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene to differentiate: plain NumPy. `lights` are as in `reference.render_phong`.
+
+    `piercing` tells that faces intersect; `nodes` is the order of `render_box`'s integration.
+    """
+
+    objects: list[Object]
+    eye: tuple
+    target: tuple
+    fov_y: float
+    up: tuple = (0.08, 1.0, 0.03)
+    near: float = 0.5
+    far: float = 20.0
+    lights: list = field(default_factory=lambda: LIGHTS)
+    background: tuple = (0.25, 0.35, 0.5)
+    shading: str = "phong"
+    cull_backfaces: bool = False
+    piercing: bool = False
+    nodes: int = 3
+    size: int = 96
+
+
+LIGHTS = [
+    {"type": "ambient", "ambient": (0.3, 0.3, 0.35)},
+    {
+        "type": "directional",
+        "direction": (-0.45, -0.65, -0.6),
+        "ambient": (0.1, 0.1, 0.1),
+        "diffuse": (0.8, 0.75, 0.7),
+        "specular": (0.4, 0.4, 0.4),
+    },
+]
+WARM = {
+    "ambient": (0.7, 0.4, 0.3),
+    "diffuse": (0.9, 0.6, 0.45),
+    "specular": (0.5, 0.5, 0.5),
+    "shininess": 8.0,
+}
+COLD = {
+    "ambient": (0.2, 0.4, 0.35),
+    "diffuse": (0.3, 0.7, 0.5),
+    "specular": (0.4, 0.4, 0.4),
+    "shininess": 8.0,
+}
+
+
+# Motion.
+
+
+def so3_exp(w) -> np.ndarray:
+    """Rotation by |w| radians about w."""
+    w = np.asarray(w, np.float64)
+    angle = np.linalg.norm(w)
+    cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    half = np.sinc(angle / (2 * np.pi))
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + half**2 / 2 * cross @ cross
+
+
+def moved(problem, params=None) -> tuple:
+    """Return (positions, normals, faces, view, projection, material) for 13 parameters.
+
+    Positions and normals are in world space, material values have one entry a face. The view is
+    T(translation) @ R(so3_exp(rotation)) @ look_at(eye, target, up), and object 0 is turned about
+    its pivot before it is shifted. The parameters are
+
+        0:3    rotation vector of the camera, in eye axes
+        3:6    translation of the camera, in eye axes
+        6      change of log(tan(fov_y / 2))
+        7:10   rotation vector of object 0 about its pivot, in world axes
+        10:13  translation of object 0, in world axes.
+    """
+    params = np.zeros(PARAMETERS) if params is None else np.asarray(params, np.float64)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = so3_exp(params[0:3]), params[3:6]
+    view = motion @ look_at(problem.eye, problem.target, problem.up)
+    tangent = np.tan(problem.fov_y / 2) * np.exp(params[6])
+    projection = perspective(2 * np.arctan(tangent), 1.0, problem.near, problem.far)
+
+    positions, normals, faces, start = [], [], [], 0
+    for index, thing in enumerate(problem.objects):
+        rotation, shift = np.eye(3), np.zeros(3)
+        if index == 0:
+            rotation, shift = so3_exp(params[7:10]), params[10:13]
+        positions.append((thing.vertices - thing.pivot) @ rotation.T + thing.pivot + shift)
+        normals.append(thing.normals @ rotation.T)
+        faces.append(thing.faces + start)
+        start += len(thing.vertices)
+    material = {
+        key: np.concatenate(
+            [
+                np.repeat(np.asarray(thing.material[key], np.float64)[None], len(thing.faces), 0)
+                for thing in problem.objects
+            ]
+        )
+        for key in ("ambient", "diffuse", "specular", "shininess")
+    }
+    parts = np.concatenate(positions), np.concatenate(normals), np.concatenate(faces)
+    return *parts, view, projection, material
+
+
+def pixels_moved(problem, params) -> float:
+    """Root mean square motion in pixels of those surface points in the image that move at all."""
+    here, there = _surface_pixels(problem, np.zeros(PARAMETERS)), _surface_pixels(problem, params)
+    inside = np.all((here > 0) & (here < problem.size) & np.isfinite(there), axis=1)
+    distance = np.linalg.norm((there - here)[inside], axis=1)
+    return float(np.sqrt(np.mean(distance[distance > 0] ** 2)))
+
+
+def _surface_pixels(problem, params) -> np.ndarray:
+    """Points scattered over all faces, hidden ones too, in pixels; NaN behind the near plane."""
+    positions, _, faces, view, projection, _ = moved(problem, params)
+    random = np.random.default_rng(SEED)
+    counts = np.array([len(thing.faces) for thing in problem.objects])
+    starts = np.cumsum(counts) - counts
+    chosen = np.concatenate(
+        [start + random.integers(n, size=4096) for start, n in zip(starts, counts, strict=True)]
+    )
+    weights = random.dirichlet(np.ones(3), size=len(chosen))
+    points = np.einsum("nk,nkc->nc", weights, positions[faces[chosen]])
+    clip = np.pad(points, ((0, 0), (0, 1)), constant_values=1) @ (projection @ view).T
+    w = np.where(clip[:, 3:] > problem.near, clip[:, 3:], np.nan)
+    return (clip[:, :2] / w * [1, -1] + 1) * problem.size / 2
+
+
+# Images and derivatives.
+
+
+def reference_image(problem, params=None, lines=32, levelness=None) -> np.ndarray:
+    """Return the image (H, W, 3) after the motion `params`.
+
+    It is a mean of two integrals, over level and over upright lines, `levelness` (H, W, 1) being
+    the weight of the latter: by default, that of the image.
+    """
+    level, upright = (_render(problem, params, lines, upright) for upright in (False, True))
+    weight = _levelness((level + upright) / 2) if levelness is None else levelness
+    return (1 - weight) * level + weight * upright
+
+
+def _levelness(image) -> np.ndarray:
+    """From 0 where outlines are upright to 1 where they are level: (H, W, 1)."""
+    squares = [np.sum(np.gradient(image, axis=axis) ** 2, axis=-1) for axis in (0, 1)]
+    for axis in (0, 1):  # over 3 x 3 pixels
+        padded = [np.pad(s, [(int(i == axis),) * 2 for i in (0, 1)], mode="edge") for s in squares]
+        squares = [
+            sum(np.take(s, np.arange(k, k + image.shape[axis]), axis=axis) for k in range(3))
+            for s in padded
+        ]
+    level, upright = (s**2 + 1e-12 for s in squares)
+    return (level / (level + upright))[..., None]
+
+
+def _render(problem, params, lines, upright) -> np.ndarray:
+    positions, normals, faces, view, projection, material = moved(problem, params)
+    return render_box(
+        positions,
+        normals,
+        faces,
+        view,
+        projection,
+        lights=problem.lights,
+        material=material,
+        background=problem.background,
+        height=problem.size,
+        width=problem.size,
+        lines=lines,
+        nodes=problem.nodes,
+        shading=problem.shading,
+        cull_backfaces=problem.cull_backfaces,
+        piercing=problem.piercing,
+        upright=upright,
+    )
+
+
+def step_sizes(problem) -> np.ndarray:
+    """For each parameter the change that moves things by one pixel."""
+    tiny = 1e-6
+    return np.array([tiny / pixels_moved(problem, tiny * axis) for axis in np.eye(PARAMETERS)])
+
+
+def reference_jacobian(problem, lines=32, step=STEP) -> np.ndarray:
+    """Return the derivatives (13, H, W, 3) of the image at rest.
+
+    Central differences D over `step` pixels and twice as many give (4 D(step) - D(2 step)) / 3.
+    """
+
+    levelness = _levelness(reference_image(problem, lines=lines))
+
+    def difference(change) -> np.ndarray:
+        ahead, behind = (reference_image(problem, s * change, lines, levelness) for s in (1, -1))
+        return (ahead - behind) / (2 * np.linalg.norm(change))
+
+    changes = step * np.diag(step_sizes(problem))
+    return np.stack([(4 * difference(c) - difference(2 * c)) / 3 for c in changes])
+
+
+def adjoint_fields(size=96, count=16) -> np.ndarray:
+    """Return (count, size, size, 3): white noise blurred by a Gaussian of 4 pixels, of RMS one.
+
+    The blur wraps round the image, and the channels are independent.
+    """
+    noise = np.random.default_rng(SEED).normal(size=(count, size, size, 3))
+    frequency = np.fft.fftfreq(size)
+    blur = np.exp(-2 * (np.pi * 4.0 * frequency) ** 2)
+    blur = (blur[:, None] * blur)[None, :, :, None]
+    fields = np.fft.ifft2(np.fft.fft2(noise, axes=(1, 2)) * blur, axes=(1, 2)).real
+    return fields / np.sqrt(np.mean(fields**2, axis=(1, 2, 3), keepdims=True))
+
+
+def project(jacobian) -> np.ndarray:
+    """Sums over pixels and channels of the fields times the Jacobian: (16, 13)."""
+    return np.einsum("fhwc,phwc->fp", adjoint_fields(jacobian.shape[1]), jacobian, optimize=True)
+
+
+def target_params(problem) -> np.ndarray:
+    """Return a random motion (13,) by 1.5 pixels, to which each parameter adds as much."""
+    params = np.random.default_rng(SEED + 1).choice([-1.0, 1.0], PARAMETERS) * step_sizes(problem)
+    params *= 0.4
+    for _ in range(4):
+        params *= 1.5 / pixels_moved(problem, params)
+    return params
+
+
+# Scenes.
+
+
+def _object(mesh, material, scale=1.0, turn=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)) -> Object:
+    rotation = so3_exp(turn)
+    vertices = scale * np.asarray(mesh.vertices, np.float64) @ rotation.T + shift
+    normals = np.asarray(mesh.normals, np.float64) @ rotation.T
+    return Object(vertices, np.asarray(mesh.faces), normals, material, np.asarray(shift, float))
+
+
+def cubes() -> Problem:
+    """Two separate cubes, one partly in front of the other."""
+    front = _object(dr.shapes.cube(), WARM, 0.6, (0.4, 0.6, 0.2), (-0.45, -0.2, 0.9))
+    back = _object(dr.shapes.cube(), COLD, 0.75, (-0.5, 0.9, 0.4), (0.5, 0.3, -1.0))
+    return Problem([front, back], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.72)
+
+
+def sphere() -> Problem:
+    """A smooth sphere of 5,120 faces."""
+    ball = _object(dr.shapes.icosphere(4), WARM, 1.0, (0.3, 0.5, 0.2), (0.05, -0.1, 0.0))
+    return Problem([ball], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.6)
+
+
+def torus(edge) -> Problem:
+    """A smooth torus, about 70 pixels across, whose edges are about `edge` pixels long."""
+    around, across = round(157 / edge), max(round(63 / edge), 8)
+    mesh = dr.shapes.torus(1.0, 0.4, major_segments=around, minor_segments=across)
+    ring = _object(mesh, WARM, 1.0, (-0.9, 0.35, 0.2), (0.05, -0.05, 0.0))
+    fine = edge < 1
+    return Problem(
+        [ring], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.72, nodes=2 if fine else 3
+    )
+
+
+def lattice() -> Problem:
+    """A plate with square holes, bars and holes about 2.5 pixels wide, in front of nothing."""
+    cells = 23
+    odd = np.arange(cells) % 2 == 1
+    solid = np.zeros((cells + 2, cells + 2, 3), bool)
+    solid[1:-1, 1:-1, 1] = ~(odd[:, None] & odd)
+    mesh = _blocks(solid)
+    thing = _object(mesh, WARM, 0.1, (0.35, 0.5, 0.3), (0.0, 0.05, 0.0))
+    return Problem([thing], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.72)
+
+
+def _blocks(solid) -> dr.Mesh:
+    """Surface of unit blocks at the cells of `solid` (no block at its borders), centred."""
+    corners, normals = [], []
+    for axis in range(3):
+        u, v = np.eye(3)[(axis + 1) % 3] / 2, np.eye(3)[(axis + 2) % 3] / 2
+        for sign in (1, -1):
+            bare = np.argwhere(solid & ~np.roll(solid, -sign, axis=axis))
+            normal = sign * np.eye(3)[axis]
+            middle = (bare + normal / 2)[:, None]
+            corners.append(
+                middle + np.stack([-u - sign * v, u - sign * v, u + sign * v, sign * v - u])
+            )
+            normals.append(np.tile(normal, (4 * len(bare), 1)))
+    vertices = np.concatenate(corners).reshape(-1, 3) - (np.array(solid.shape) - 1) / 2
+    quads = np.arange(len(vertices)).reshape(-1, 4)
+    faces = quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    return dr.Mesh(vertices=vertices, faces=faces, normals=np.concatenate(normals))
+
+
+def piercing() -> Problem:
+    """Two cubes that intersect each other."""
+    first = _object(dr.shapes.cube(), WARM, 0.7, (0.4, 0.6, 0.2), (-0.3, -0.1, 0.3))
+    second = _object(dr.shapes.cube(), COLD, 0.7, (-0.5, 0.9, 0.4), (0.35, 0.2, -0.1))
+    eye, target = (0.4, 0.9, 5.0), (0.0, 0.0, 0.0)
+    return Problem([first, second], eye=eye, target=target, fov_y=0.6, piercing=True)
+
+
+def border() -> Problem:
+    """A cube and a sphere that leave the image on all sides."""
+    box = _object(dr.shapes.cube(), WARM, 0.9, (0.4, 0.6, 0.2), (-1.0, -0.5, 1.4))
+    ball = _object(dr.shapes.icosphere(4), COLD, 1.3, (0.1, 0.2, 0.3), (1.1, 0.6, 0.0))
+    return Problem([box, ball], eye=(0.2, 0.5, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.45)
+
+
+def crease() -> Problem:
+    """A sphere of 320 flat faces."""
+    ball = _object(dr.shapes.icosphere(2), WARM, 1.0, (0.3, 0.5, 0.2), (0.05, -0.1, 0.0))
+    eye, target = (0.4, 0.9, 5.0), (0.0, 0.0, 0.0)
+    return Problem([ball], eye=eye, target=target, fov_y=0.6, shading="flat")
+
+
+SCENES: dict[str, Callable[[], Problem]] = {
+    "cubes": cubes,
+    "sphere": sphere,
+    "torus8": lambda: torus(8.0),
+    "torus2": lambda: torus(2.0),
+    "torus05": lambda: torus(0.5),
+    "torus025": lambda: torus(0.25),
+    "lattice": lattice,
+    "piercing": piercing,
+    "border": border,
+    "crease": crease,
+}
+
+
+# The stored file.
+
+
+def load(name) -> dict[str, np.ndarray]:
+    """Return what is stored for a scene, in float64."""
+    prefix = f"{name}/"
+    with np.load(STORE) as data:
+        keys = [key for key in data if key.startswith(prefix)]
+        return {key.removeprefix(prefix): data[key].astype(np.float64) for key in keys}
+
+
+def compute(problem) -> dict[str, np.ndarray]:
+    """Return what is to be stored for a scene."""
+    jacobian, params = reference_jacobian(problem), target_params(problem)
+    residual = reference_image(problem) - reference_image(problem, params)
+    return {
+        "projections": project(jacobian),
+        "target_image_params": params,
+        "l2_gradient": np.einsum("phwc,hwc->p", jacobian, residual),
+    }
+
+
+def check(problem) -> None:
+    """Print how far the projections depend on the number of lines and on the step.
+
+    In proportion to those of the same group of parameters, and to those of all parameters in
+    units of pixels: a smooth sphere, say, hardly changes when it turns.
+    """
+    base = project(reference_jacobian(problem))
+    others = {
+        "twice the lines": project(reference_jacobian(problem, lines=64)),
+        "half the step": project(reference_jacobian(problem, step=STEP / 2)),
+    }
+    steps = step_sizes(problem)
+    whole = np.linalg.norm(base * steps)
+    for what, other in others.items():
+        for group, part in GROUPS.items():
+            error = np.linalg.norm((other - base)[:, part]) / np.linalg.norm(other[:, part])
+            share = np.linalg.norm(((other - base) * steps)[:, part]) / whole
+            print(f"  {what:16} {group:19} {error:.2e}, of all groups {share:.2e}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Compute the stored reference derivatives.")
+    parser.add_argument("--scenes", help="do these only, and keep what is stored of the others")
+    parser.add_argument("--check", metavar="SCENE", help="print convergence, store nothing")
+    parser.add_argument("--size", type=int, default=96, help="side of the image in pixels")
+    arguments = parser.parse_args()
+    if arguments.check:
+        return check(replace(SCENES[arguments.check](), size=arguments.size))
+    stored = {}
+    if arguments.scenes and STORE.exists():
+        with np.load(STORE) as data:
+            stored = dict(data)
+    STORE.parent.mkdir(exist_ok=True)
+    for name in arguments.scenes.split(",") if arguments.scenes else SCENES:
+        start = time.perf_counter()
+        problem = replace(SCENES[name](), size=arguments.size)
+        results = compute(problem)
+        stored |= {f"{name}/{key}": value.astype(np.float32) for key, value in results.items()}
+        np.savez_compressed(STORE, **stored)
+        faces = sum(len(thing.faces) for thing in problem.objects)
+        print(f"{name}: {faces} faces, {time.perf_counter() - start:.0f} s", flush=True)
+    return None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""The stage that anti-aliases edges: its derivative as a linear map, its limits, its cost."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrast as dr
+from diffrast._topology import topology_of, traced_topology
+from diffrast.edges.blend import Method, View, apply_linear, collect
+from diffrast.raster.coverage import visible_faces
+
+SETTINGS = dr.RenderSettings(height=20, width=24, antialias=True)
+LIGHTS = [dr.DirectionalLight(direction=(-0.4, -0.5, -1.0))]
+MESH = dr.shapes.torus(1.0, 0.4, major_segments=9, minor_segments=6)
+
+
+def camera(eye=(0.3, 2.0, 3.0)):
+    return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.9, near=0.1, far=30.0)
+
+
+@jax.jit
+def image(vertices, camera):
+    mesh = dataclasses.replace(MESH, vertices=vertices)
+    return dr.render(dr.Scene(objects=[dr.Object(mesh)], lights=LIGHTS), camera, SETTINGS)
+
+
+@jax.jit
+def pulled(vertices, camera, cotangent):
+    return jax.vjp(image, vertices, camera)[1](cotangent)
+
+
+@jax.jit
+def pushed(vertices, camera, change):
+    return jax.jvp(lambda v: image(v, camera), (vertices,), (change,))
+
+
+def test_both_directions_of_the_derivative_agree():
+    random = np.random.default_rng(1)
+    change = jnp.asarray(random.normal(size=MESH.vertices.shape), jnp.float32)
+    cotangent = jnp.asarray(random.normal(size=(20, 24, 3)), jnp.float32)
+    value, moved = pushed(MESH.vertices, camera(), change)
+    np.testing.assert_allclose(value, image(MESH.vertices, camera()), atol=1e-6)
+    forward = np.vdot(moved, cotangent)
+    reverse = np.vdot(pulled(MESH.vertices, camera(), cotangent)[0], change)
+    assert abs(forward - reverse) < 1e-4 * np.linalg.norm(moved) * np.linalg.norm(cotangent)
+    for _ in range(2):
+        again = np.vdot(pulled(MESH.vertices, camera(), cotangent)[0], change)
+        assert again == reverse
+
+
+def test_views_may_be_mapped():
+    eyes = [(0.3, 2.0, 3.0), (1.5, 1.0, -2.0)]
+    cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(camera(eye) for eye in eyes))
+    together = jax.jit(jax.vmap(image, in_axes=(None, 0)))(MESH.vertices, cameras)
+    for one, eye in zip(together, eyes, strict=True):
+        np.testing.assert_allclose(one, image(MESH.vertices, camera(eye)), atol=1e-6)
+
+
+@pytest.mark.parametrize("case", ["flat", "point", "edge-on", "behind", "inside", "huge", "tiny"])
+def test_values_and_derivatives_are_finite(case):
+    vertices, eye = MESH.vertices, (0.3, 2.0, 3.0)
+    if case == "flat":
+        vertices = vertices * jnp.array([1.0, 0.0, 1.0])
+    elif case == "point":
+        vertices = vertices * 0
+    elif case == "edge-on":
+        vertices, eye = vertices * jnp.array([1.0, 0.0, 1.0]), (0.0, 0.0, 3.0)
+    elif case == "behind":
+        vertices = vertices + jnp.array([0.3, 2.0, 6.0])
+    elif case == "inside":
+        eye = (1.0, 0.05, 0.1)
+    elif case == "huge":
+        vertices = vertices * 1e6
+    elif case == "tiny":
+        vertices = vertices * 1e-6
+    cotangent = jnp.ones((20, 24, 3))
+    assert np.all(np.isfinite(image(vertices, camera(eye))))
+    for leaf in jax.tree.leaves(pulled(vertices, camera(eye), cotangent)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            assert np.all(np.isfinite(leaf))
+
+
+def test_no_piece_is_lost_however_few_records_there_are():
+    size = 24
+    clip = dr.world_to_clip(camera(), MESH.vertices)
+    bordered = clip * jnp.array([size / (size + 2), size / (size + 2), 1, 1])
+    ids = visible_faces(bordered, MESH.faces, height=size + 2, width=size + 2, cull_backfaces=False)
+    color = jnp.asarray(np.random.default_rng(3).uniform(size=(len(MESH.faces) + 1, 3)))
+    view = View(
+        positions_clip=clip,
+        faces=MESH.faces,
+        turned=None,
+        topology=MESH.topology,
+        apart=jnp.ones_like(MESH.topology.edges.seam),
+        face_image=ids,
+        image=color[ids].astype(jnp.float32),
+        background=color[-1].astype(jnp.float32),
+        scene=None,
+    )
+
+    @jax.jit
+    def results(capacity_of):
+        capacity = capacity_of.shape[0]
+        method = Method(None, False, capacity)
+        found = collect(view, method)
+
+        def change(points, colors):
+            return apply_linear(view, method, found, points, colors)
+
+        points = jnp.ones((len(clip), 3)) * 0.1
+        colors = jnp.ones(((size + 2) ** 2, 3)) * jnp.arange(3.0)
+        pushed, pull = jax.vjp(change, points, colors)
+        return (
+            found.records.total,
+            found.added,
+            pushed,
+            pull(jnp.sin(jnp.arange(pushed.size)).reshape(pushed.shape)),
+        )
+
+    many, few = results(jnp.zeros(1024)), results(jnp.zeros(100))
+    assert 300 < many[0] == few[0]
+    for a, b in zip(jax.tree.leaves(many[1:]), jax.tree.leaves(few[1:]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_topology_is_the_same_whether_traced_or_not():
+    for mesh in (MESH, dr.shapes.cube(), dr.shapes.icosphere(1)):
+        host = topology_of(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        traced = jax.jit(traced_topology)(mesh.vertices, mesh.faces)
+        assert np.array_equal(host.neighbors, traced.neighbors)
+        assert np.array_equal(host.patches, traced.patches)
+        used = np.asarray(traced.edges.faces[:, 0]) >= 0
+
+        def rows(edges, used):
+            pairs = np.sort(np.asarray(edges.faces)[used], axis=1)
+            return sorted(map(tuple, np.column_stack([pairs, np.asarray(edges.seam)[used]])))
+
+        assert rows(host.edges, slice(None)) == rows(traced.edges, used)
+    cube = dr.shapes.cube().topology
+    assert len(np.unique(cube.patches)) == 12  # each triangle has vertices of its own
+    assert np.all(np.asarray(cube.neighbors) >= 0)
+    assert len(np.unique(MESH.topology.patches)) == 1
+
+
+def test_edges_cost_nothing_where_they_are_off():
+    scene = dr.Scene(objects=[dr.Object(MESH)], lights=LIGHTS)
+    off = dataclasses.replace(SETTINGS, antialias=False)
+    text = dr.render.lower(scene, camera(), off).as_text(debug_info=True)
+    assert "/edges/" not in text
+    assert "/edges/" in dr.render.lower(scene, camera(), SETTINGS).as_text(debug_info=True)
