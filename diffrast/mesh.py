@@ -84,7 +84,13 @@ class Mesh:
         set_field(self, "faces", indices)
         set_field(self, "normals", normals)
         set_field(self, "uvs", uvs)
-        topology = _topology_of(positions, indices) if topology is None else topology
+        if topology is None:
+            topology = _topology_of(positions, indices)
+        elif topology.patches.shape[0] != indices.shape[0]:
+            raise ValueError(
+                f"topology: wanted that of {indices.shape[0]} faces, got one of"
+                f" {topology.patches.shape[0]}; pass None where faces change"
+            )
         set_field(self, "topology", topology)
 
 

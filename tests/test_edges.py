@@ -145,6 +145,11 @@ def test_topology_is_the_same_whether_traced_or_not():
     assert len(np.unique(MESH.topology.patches)) == 1
 
 
+def test_topology_of_other_faces_is_refused():
+    with pytest.raises(ValueError, match="topology"):
+        dataclasses.replace(MESH, faces=MESH.faces[:-1])
+
+
 def test_edges_cost_nothing_where_they_are_off():
     scene = dr.Scene(objects=[dr.Object(MESH)], lights=LIGHTS)
     off = dataclasses.replace(SETTINGS, antialias=False)

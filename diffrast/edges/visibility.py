@@ -242,8 +242,8 @@ def _ring(face: Array, without: Array | None, neighbors: Array, drawn: Array) ->
             return near
         return [jnp.where(n == without, near[2], n) for n in near[:2]]
 
-    ring = others(face, without)
-    ring = jnp.stack([*ring, *(f for one in ring for f in others(one, face))])
+    next_to = others(face, without)
+    ring = jnp.stack([*next_to, *(f for one in next_to for f in others(one, face))])
     return jnp.where((ring >= 0) & drawn[jnp.maximum(ring, 0)], ring, -1)
 
 
