@@ -9,7 +9,7 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
-from diffrast.edges.blend import Method, Shader, View, apply_linear, collect, linear_zeros
+from diffrast.edges.blend import Blended, Method, Shader, View, apply_linear, collect, linear_zeros
 
 
 def antialias_image(
@@ -27,13 +27,16 @@ def antialias_image(
     method = Method(shader, cull_backfaces, capacity)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
 
-    def with_edges(image: Array, added: Array) -> Array:
-        return image[1:-1, 1:-1] + added.reshape(height, width, channels)
+    def with_edges(image: Array, found: Blended) -> Array:
+        added, low, high = (
+            part.reshape(height, width, channels) for part in (found.added, *found.range)
+        )
+        return jnp.clip(image[1:-1, 1:-1] + added, low, high)
 
     @jax.custom_jvp
     def blended(image: Array, positions_clip: Array, rest: View) -> Array:
         now = rest._replace(image=image, positions_clip=positions_clip)
-        return with_edges(image, gather(now).added)
+        return with_edges(image, gather(now))
 
     def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
         image, positions_clip, rest = primals
@@ -53,7 +56,7 @@ def antialias_image(
             axis=-1,
         )
         d_out = apply_linear(now, method, found, points, d_image.reshape(-1, channels))
-        return with_edges(image, found.added), d_out.reshape(height, width, channels)
+        return with_edges(image, found), d_out.reshape(height, width, channels)
 
     blended.defjvp(derivative, symbolic_zeros=True)
     return blended(view.image, view.positions_clip, lax.stop_gradient(view))

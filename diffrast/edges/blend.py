@@ -83,6 +83,7 @@ class Blended(NamedTuple):
 
     records: Records
     added: Float[Array, "pixels channels"]
+    range: tuple[Array, Array]  # least and greatest colours that each pixel holds
     rims: Float[Array, " pixels_with_border"]  # length of smooth rims about a pixel's centre
 
 
@@ -184,6 +185,10 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
         pixel = jnp.where(used, pieces.row * width + pieces.column, 0)
         added = total.added.at[pixel].add(jnp.where(used[:, None], value, 0))
+        held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
+        low, high = total.range
+        low = low.at[pixel].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
+        high = high.at[pixel].max(jnp.where(used[:, None], jnp.max(held, axis=0), -jnp.inf))
         rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
         rims = total.rims.at[places[0]].add(rim_length)
 
@@ -200,7 +205,8 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         columns = (
             old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
         )
-        return Blended(Records(records.total + jnp.sum(used), *columns), added, rims)
+        records = Records(records.total + jnp.sum(used), *columns)
+        return Blended(records, added, (low, high), rims)
 
     def add_edges(n: Array, total: Blended) -> Blended:
         slots = n * EDGES_AT_ONCE + jnp.arange(EDGES_AT_ONCE)
@@ -229,9 +235,11 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         jnp.zeros((rows, 2), dtype) + zero,
         jnp.zeros((rows, 6), dtype) + zero,
     )
+    own = _cropped(flat, image.shape)
     nothing = Blended(
         records,
         jnp.zeros((height * width, channels), dtype) + zero,
+        (own, own),
         jnp.zeros((height + 2) * (width + 2), dtype) + zero,
     )
     chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
@@ -306,7 +314,7 @@ def _push(
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
     at the next pixel inwards stands for it.
     """
-    records, _, rims = blended
+    records, rims = blended.records, blended.rims
 
     def average(used: Array, rows: Any, total: Array) -> Array:
         integers, _, weights, _ = rows
@@ -334,7 +342,7 @@ def _pull(
     view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
 ) -> tuple[Array, Array]:
     """The transpose of `_push`, added to `points` and `colors`."""
-    records, _, rims = blended
+    records, rims = blended.records, blended.rims
     own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
     own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
 
