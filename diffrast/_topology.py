@@ -1,6 +1,7 @@
-"""Who touches whom in a mesh: welding, edges, polygons. NumPy on the host, no derivatives.
+"""Who touches whom in a mesh: welding, edges, polygons. No derivatives.
 
-Topology is discrete and is made once per mesh, outside anything that JAX traces; `diffrast.mesh`
+Topology is discrete and is made once per mesh, by NumPy on the host, outside anything that JAX
+traces; only `traced_topology` is for meshes whose arrays are known no earlier. `diffrast.mesh`
 checks the arguments, converts between JAX and NumPy, and is the public face of this file.
 """
 
@@ -143,7 +144,8 @@ def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
     labels = np.arange(len(positions), dtype=np.int32)
     while True:
         before, labels = labels, labels.copy()
-        np.minimum.at(labels, faces, np.min(before[faces], axis=1)[:, None])
+        roots = before[faces]
+        np.minimum.at(labels, roots, np.min(roots, axis=1)[:, None])
         labels = labels[labels]
         if np.array_equal(labels, before):
             break
@@ -191,7 +193,8 @@ def traced_topology(positions: Array, faces: Array) -> Topology:
 
     def join(state: tuple[Array, Array]) -> tuple[Array, Array]:
         labels, _ = state
-        joined = labels.at[faces].min(jnp.min(labels[faces], axis=1)[:, None])
+        roots = labels[faces]
+        joined = labels.at[roots].min(jnp.min(roots, axis=1)[:, None])
         return joined[joined], labels
 
     labels = jnp.arange(positions.shape[0], dtype=jnp.int32) + 0 * faces[0, 0]

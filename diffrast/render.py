@@ -218,7 +218,9 @@ def render(
         with jax.named_scope("edges"):
             image = assemble(stored(color, geometry.faces))
             image = _with_edges(image, scene, camera, geometry, clip, pixels, background, settings)
-            color = [image[..., c] for c in range(3)]
+        if side == 1:
+            return image
+        color = [image[..., c] for c in range(3)]
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
     return assemble(stored(color, geometry.faces))

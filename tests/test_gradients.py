@@ -4,6 +4,7 @@ The numbers in data/gradients.npz are made by `python tests/gradient_reference.p
 errors of all scenes, large ones included: `python tests/test_gradients.py`.
 """
 
+import sys
 from dataclasses import replace
 
 import gradient_reference as reference
@@ -156,8 +157,6 @@ def errors(name, **options):
 
 
 def main():
-    import sys
-
     for name in sys.argv[1:] or reference.SCENES:
         found = errors(name)
         text = "  ".join(f"{key} {value:.4f}" for key, value in found.items())

@@ -10,6 +10,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
 from diffrast.edges.blend import Blended, Method, Shader, View, apply_linear, collect, linear_zeros
+from diffrast.edges.pieces import to_pixels
 
 
 def antialias_image(
@@ -47,14 +48,8 @@ def antialias_image(
             d_clip = linear_zeros(positions_clip.shape, d_image)
         now = lax.stop_gradient(rest._replace(image=image, positions_clip=positions_clip))
         found = gather(now)
-        points = jnp.stack(
-            [
-                (d_clip[:, 0] + d_clip[:, 3]) * (width / 2),
-                (d_clip[:, 3] - d_clip[:, 1]) * (height / 2),
-                d_clip[:, 3],
-            ],
-            axis=-1,
-        )
+        moved = to_pixels(d_clip, height, width)
+        points = jnp.stack([moved.x, moved.y, moved.w], axis=-1)
         d_out = apply_linear(now, method, found, points, d_image.reshape(-1, channels))
         return with_edges(image, found), d_out.reshape(height, width, channels)
 

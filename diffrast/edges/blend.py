@@ -293,17 +293,21 @@ def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: A
     return lax.fori_loop(0, (rows + rows_at_once - 1) // rows_at_once, step, start)
 
 
-def _over_rounds(
-    view: View, method: Method, records: Records, add: Callable[[Records, Any], Any], start: Any
+def _over_pieces(
+    view: View,
+    method: Method,
+    records: Records,
+    add: Callable[[Array, Any, Any], Any],
+    start: Any,
 ) -> Any:
     """Add up over all visible pieces: over those recorded, and what else there is by and by."""
 
     def another(n: Array, total: Any) -> Any:
         more = collect(view, method, n * method.capacity).records
-        return add(more._replace(total=more.total - n * method.capacity), total)
+        return _over_rows(more._replace(total=more.total - n * method.capacity), add, total)
 
     rounds = (records.total + method.capacity - 1) // method.capacity
-    return lax.fori_loop(1, rounds, another, add(records, start))
+    return lax.fori_loop(1, rounds, another, _over_rows(records, add, start))
 
 
 def _push(
@@ -329,13 +333,11 @@ def _push(
         return total.at[pixel].add(jnp.where(used[:, None], value, 0))
 
     if method.shader is not None:
-        sums = _over_rounds(
-            view, method, records, lambda r, t: _over_rows(r, average, t), jnp.zeros_like(colors)
-        )
+        sums = _over_pieces(view, method, records, average, jnp.zeros_like(colors))
         rim = (rims > 0)[:, None]
         colors = jnp.where(rim, sums / jnp.where(rim, rims[:, None], 1), colors)
     added = added + _cropped(colors, view.image.shape)
-    return _over_rounds(view, method, records, lambda r, t: _over_rows(r, add, t), added)
+    return _over_pieces(view, method, records, add, added)
 
 
 def _pull(
@@ -356,9 +358,7 @@ def _pull(
         value = value * weights[:, :1]
         return points, colors.at[beyond].add(value).at[front].add(-value)
 
-    points, own = _over_rounds(
-        view, method, records, lambda r, t: _over_rows(r, add, t), (points, own)
-    )
+    points, own = _over_pieces(view, method, records, add, (points, own))
     if method.shader is None:
         return points, colors + own
     rim = (rims > 0)[:, None]
@@ -370,7 +370,7 @@ def _pull(
         _, front, _, inner, _, _ = integers.T
         return total.at[inner].add(jnp.where(used, weights[:, 1], 0)[:, None] * sums[front])
 
-    own = _over_rounds(view, method, records, lambda r, t: _over_rows(r, average, t), own)
+    own = _over_pieces(view, method, records, average, own)
     return points, colors + own
 
 

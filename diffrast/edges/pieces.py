@@ -142,14 +142,8 @@ def clip_edges(
     def heights(v: Pixelled) -> list[Array]:
         return [v.w + v.z, v.w - v.z, v.x, width * v.w - v.x, v.y, height * v.w - v.y]
 
-    low, high = jnp.zeros_like(first.x), jnp.ones_like(first.x)
-    visible = exists
-    for h, k in zip(heights(first), heights(last), strict=True):
-        visible = visible & ((h >= 0) | (k >= 0))
-        crossing = h / jnp.where((h < 0) == (k < 0), 1, h - k)
-        low = jnp.where((h < 0) & (k >= 0), jnp.maximum(low, crossing), low)
-        high = jnp.where((h >= 0) & (k < 0), jnp.minimum(high, crossing), high)
-    visible = visible & (low < high)
+    low, high = positive_part(heights(first), heights(last))
+    visible = exists & (low < high)
 
     def project(s: Array) -> tuple[Array, Array, Array]:
         x, y, w = (p + s * (q - p) for p, q in zip(first, last, strict=True) if p is not first.z)
@@ -176,6 +170,19 @@ def clip_edges(
         range=(low, high),
         parts=parts,
     )
+
+
+def positive_part(first: list[Array], last: list[Array]) -> tuple[Array, Array]:
+    """Where on a line, 0 to 1, values are positive that change linearly from `first` to `last`.
+
+    Where there is no such part its begin is not below its end.
+    """
+    low, high = jnp.zeros_like(first[0]), jnp.ones_like(first[0])
+    for a, b in zip(first, last, strict=True):
+        crossing = a / jnp.where((a < 0) == (b < 0), 1, a - b)
+        low = jnp.where(a < 0, jnp.where(b < 0, 2, jnp.maximum(low, crossing)), low)
+        high = jnp.where((a >= 0) & (b < 0), jnp.minimum(high, crossing), high)
+    return low, high
 
 
 def _forward(start: Array, end: Array) -> tuple[Array, Array]:

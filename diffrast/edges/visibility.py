@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._topology import Topology
-from diffrast.edges.pieces import Pieces, Pixelled, Segments
+from diffrast.edges.pieces import Pieces, Pixelled, Segments, positive_part
 
 _TOLERANCE = 1e-3  # of 1/w: surfaces nearer to one another than this touch
 _BEYOND = 5e-4  # pixels from the edge to the point that shows what is behind it
@@ -149,12 +149,12 @@ def look(
     # What is behind.
     x, y = (m + c + _BEYOND * n for m, c, n in zip(centre, middle, out, strict=True))
     edge_values, depth = candidates.at(x, y)
-    covers = foreign & jnp.all(jnp.stack([e >= 0 for e in edge_values]), axis=0)
+    covers = foreign & candidates.covers(edge_values)
     candidate = jnp.where(covers & (depth <= near * (1 + _TOLERANCE)), depth, 0)
     best = jnp.argmax(candidate, axis=0)
     found = fold & (jnp.max(candidate, axis=0) > 0)
     beyond = jnp.where(fold, jnp.where(found, _picked(around, best), -1), other)
-    behind = locate(jnp.maximum(beyond, 0), faces, pixels, x, y)[2]
+    _, behind = locate(jnp.maximum(beyond, 0), faces, pixels, x, y)
 
     # Pixels whose centres lie on either side. What the rasteriser shows of an edge that passes
     # through a centre tells on which side that is.
@@ -252,11 +252,7 @@ def _unhidden(foreign: Array, first: list[Array], last: list[Array]) -> tuple[Ar
 
     A face hides what all values, which change linearly from `first` to `last`, are positive for.
     """
-    low, high = jnp.zeros_like(first[0]), jnp.ones_like(first[0])
-    for a, b in zip(first, last, strict=True):
-        crossing = a / jnp.where((a < 0) == (b < 0), 1, a - b)
-        low = jnp.where(a < 0, jnp.where(b < 0, 2, jnp.maximum(low, crossing)), low)
-        high = jnp.where((a >= 0) & (b < 0), jnp.minimum(high, crossing), high)
+    low, high = positive_part(first, last)
     hides = foreign & (low < high)
     begin, end = jnp.zeros_like(first[0][0]), jnp.ones_like(first[0][0])
     for _ in range(_ROUNDS):
@@ -295,11 +291,11 @@ def _rim(
         return [c + m + depth * n for c, m, n in zip(centre, middle, inward, strict=True)]
 
     first = jnp.minimum(thickness, depth)
-    bend = locate(jnp.maximum(front, 0), faces, pixels, *point(first))[2]
+    _, bend = locate(jnp.maximum(front, 0), faces, pixels, *point(first))
     bend = [jnp.clip(b, 0, 1) for b in bend]
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
     beyond = jnp.where(thickness >= depth, front, _picked(pictured, inner))
-    covers, _, far = locate(jnp.maximum(beyond, 0), faces, pixels, *point(depth))
+    covers, far = locate(jnp.maximum(beyond, 0), faces, pixels, *point(depth))
     return Rim(
         smooth=(front >= 0) & same(front_look) & same(inner),
         inner=inner,
@@ -377,8 +373,8 @@ class _Planes:
     def __init__(self, face: Array, faces: Array, pixels: Pixelled) -> None:
         self.columns, self.rows, self.w = _corner_columns(face, faces, pixels)
 
-    def edges(self, x: Array, y: Array) -> tuple[list[Array], Array]:
-        """Edge functions at points on the screen, and their sum times 1/w, by the same factor."""
+    def at(self, x: Array, y: Array) -> tuple[list[Array], Array]:
+        """Three values that are positive inside, linear on the screen, and 1/w, or -1 of none."""
         w = self.w
         u = [c - x * d for c, d in zip(self.columns, w, strict=True)]
         v = [c - y * d for c, d in zip(self.rows, w, strict=True)]
@@ -387,15 +383,15 @@ class _Planes:
             u[2] * v[0] - u[0] * v[2],
             u[0] * v[1] - u[1] * v[0],
         ]
-        return e, e[0] * w[0] + e[1] * w[1] + e[2] * w[2]
-
-    def at(self, x: Array, y: Array) -> tuple[list[Array], Array]:
-        """Three values that are positive inside, linear on the screen, and 1/w, or -1 of none."""
-        e, volume = self.edges(x, y)
+        volume = e[0] * w[0] + e[1] * w[1] + e[2] * w[2]
         total = e[0] + e[1] + e[2]
         sign = jnp.where(volume < 0, -1, 1)
         depth = jnp.where(volume == 0, -1, total / jnp.where(volume == 0, 1, volume))
         return [value * sign for value in e], depth
+
+    @staticmethod
+    def covers(edge_values: list[Array]) -> Array:
+        return (edge_values[0] >= 0) & (edge_values[1] >= 0) & (edge_values[2] >= 0)
 
 
 def locate(
@@ -404,12 +400,10 @@ def locate(
     pixels: Pixelled,
     x: Float[Array, "*n"],
     y: Float[Array, "*n"],
-) -> tuple[Bool[Array, "*n"], Float[Array, "*n"], list[Float[Array, "*n"]]]:
-    """Whether faces cover points on the screen, 1/w there on their planes, and barycentrics."""
-    e, volume = _Planes(face, faces, pixels).edges(x, y)
-    total = e[0] + e[1] + e[2]
-    sign = jnp.where(total < 0, -1, 1)
-    covers = (e[0] * sign >= 0) & (e[1] * sign >= 0) & (e[2] * sign >= 0) & (total != 0)
+) -> tuple[Bool[Array, "*n"], list[Float[Array, "*n"]]]:
+    """Whether faces cover points on the screen, and barycentrics there on their planes."""
+    planes = _Planes(face, faces, pixels)
+    edge_values, depth = planes.at(x, y)
+    total = edge_values[0] + edge_values[1] + edge_values[2]
     inverse_total = 1 / jnp.where(total == 0, 1, total)
-    depth = jnp.where(volume == 0, 0, total / jnp.where(volume == 0, 1, volume))
-    return covers & (depth > 0), depth, [value * inverse_total for value in e]
+    return planes.covers(edge_values) & (depth > 0), [e * inverse_total for e in edge_values]
