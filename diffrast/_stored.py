@@ -3,34 +3,36 @@
 XLA fuses a cheap producer into each of its consumers and computes it again in every one; a gather
 even computes its operand again for every element it reads, and the assembly of channels its parts
 for every channel. `lax.optimization_barrier` does not stop the CPU compiler, which removes it
-before it fuses. What it never computes twice is a division: so a value divided by a one that is
-known only at run time is stored once, to the same bits, and so is its derivative in either
-direction.
+before it fuses. What it never computes twice is a division: so a value is divided by a one that it
+cannot know to be one until it has fused, to the same bits, and so is its derivative in either
+direction. Once fused, the division is found out and costs nothing.
 """
 
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Int
+from jax import Array, lax
 
 T = TypeVar("T")
 
 
-def stored(values: T, faces: Int[Array, "F 3"]) -> T:
-    """Store every floating-point array of a tree; `faces` serves for the one (ids are >= 0)."""
-    is_index = faces[0, 0] >= 0
+def stored(values: T) -> T:
+    """Store every array of numbers in a tree."""
 
     def store(value: Array) -> Array:
-        return value / jnp.where(is_index, 1, 2).astype(value.dtype)
+        if value.dtype == bool:
+            return value
+        same = lax.stop_gradient(value)
+        is_number = (same < 0) | (same >= 0) | (same != same)
+        return lax.div(value, jnp.where(is_number, 1, 2).astype(value.dtype))
 
     return jax.tree.map(store, values)
 
 
-def stored_rows(values: Array, faces: Int[Array, "F 3"]) -> Array:
+def stored_rows(values: Array) -> Array:
     """Store a (V, C) array, each of its columns computed once."""
-    return assemble(stored([values[:, i] for i in range(values.shape[1])], faces))
+    return assemble(stored([values[:, i] for i in range(values.shape[1])]))
 
 
 def assemble(channels: list[Array]) -> Array:

@@ -216,14 +216,14 @@ def render(
         color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
     if settings.antialias:
         with jax.named_scope("edges"):
-            image = assemble(stored(color, geometry.faces))
+            image = assemble(stored(color))
             image = _with_edges(image, scene, camera, geometry, clip, pixels, background, settings)
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
-    return assemble(stored(color, geometry.faces))
+    return assemble(stored(color))
 
 
 @jax.jit
@@ -310,7 +310,7 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
         all_faces = jnp.concatenate(faces)
 
         def joined(parts: list[Array]) -> Array:
-            return stored_rows(jnp.concatenate(parts), all_faces)
+            return stored_rows(jnp.concatenate(parts))
 
         counts = np.arange(len(scene.objects), dtype=np.int32)
         return _Geometry(
@@ -326,7 +326,7 @@ def _world_geometry(scene: Scene, shading: str) -> _Geometry:
 
 def _clip_positions(geometry: _Geometry, camera: Camera) -> Float[Array, "V 4"]:
     with jax.named_scope("project"):
-        return stored_rows(world_to_clip(camera, geometry.positions), geometry.faces)
+        return stored_rows(world_to_clip(camera, geometry.positions))
 
 
 def _with_border(positions_clip: Array, height: int, width: int) -> Array:

@@ -48,8 +48,8 @@ def antialias_image(
             d_clip = linear_zeros(positions_clip.shape, d_image)
         now = lax.stop_gradient(rest._replace(image=image, positions_clip=positions_clip))
         found = gather(now)
-        moved = to_pixels(d_clip, height, width)
-        points = jnp.stack([moved.x, moved.y, moved.w], axis=-1)
+        x, y, _, w = to_pixels(d_clip, height, width)
+        points = jnp.stack([x, y, w], axis=-1)
         d_out = apply_linear(now, method, found, points, d_image.reshape(-1, channels))
         return with_edges(image, found), d_out.reshape(height, width, channels)
 

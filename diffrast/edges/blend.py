@@ -10,7 +10,7 @@ which adds up exactly over the pieces of any outline. To first order dS is minus
 times the motion of its middle: linear in the positions, without a singularity.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -99,32 +99,24 @@ def perimeter(x: Array, y: Array) -> Array:
     )
 
 
-def _area(begin: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
+def _area(begin: Array, end: Array) -> Array:
     """Part of the pixel beyond a piece, positive if that is on the right."""
     turn = perimeter(*end) - perimeter(*begin)
     turn = turn - 4 * jnp.round(turn / 4)
     return turn / 4 - (begin[0] * end[1] - begin[1] * end[0]) / 2
 
 
-def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> list[Array]:
-    """Derivative of the area by x, y, w of the edge's start and of its end."""
+def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
+    """Derivative of the area by x, y, w of the edge's start and of its end, shape (6, n)."""
     of = pieces.segment
-    normal = [seen.end[1] - seen.begin[1], seen.begin[0] - seen.end[0]]
-    shares = [1 - seen.middle, seen.middle]
-    columns = []
-    for vertex in range(2):
-        total = [jnp.zeros_like(seen.middle) for _ in range(3)]
-        for i, (x, y) in enumerate((segments.start, segments.end)):
-            s = segments.range[i][of]
-            factor = -shares[i] * segments.weights[i][of] * (s if vertex else 1 - s)
-            across, down = factor * normal[0], factor * normal[1]
-            total = [
-                total[0] + across,
-                total[1] + down,
-                total[2] - across * x[of] - down * y[of],
-            ]
-        columns += total
-    return columns
+    across, down = seen.begin[1] - seen.end[1], seen.end[0] - seen.begin[0]
+    shares = jnp.stack([1 - seen.middle, seen.middle]) * segments.weights[:, of]
+    inside = segments.range[:, of]
+    vertex = shares * jnp.stack([1 - inside, inside])  # (start and end, clipped ends, n)
+    x, y = segments.ends[:, 0, of], segments.ends[:, 1, of]
+    total = jnp.sum(vertex, axis=1)
+    moment = jnp.sum(vertex * (across * x + down * y), axis=1)
+    return jnp.stack([total * across, total * down, -moment], axis=1).reshape(6, -1)
 
 
 def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
@@ -146,10 +138,10 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     def add_pieces(n: Array, total: Blended, segments: Segments, ends: Array) -> Blended:
         pieces = cut(segments, ends, n * PIECES_AT_ONCE, height=height, width=width)
         found = look(pieces, segments, view.faces, pixels, view.topology, seen, view.face_image)
-        rim = found.rim
+        (column, row), rim = pieces.pixel, found.rim
 
         def place(look: Array | int) -> Array:
-            return (pieces.row + look // 3) * (width + 2) + pieces.column + look % 3
+            return (row + look // 3) * (width + 2) + column + look % 3
 
         def shade(*points: tuple[Array, list[Array]]) -> list[Array]:
             assert shader is not None
@@ -183,7 +175,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             )
         size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
         used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
-        pixel = jnp.where(used, pieces.row * width + pieces.column, 0)
+        pixel = jnp.where(used, row * width + column, 0)
         added = total.added.at[pixel].add(jnp.where(used[:, None], value, 0))
         held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
         low, high = total.range
@@ -195,12 +187,12 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         records = total.records
         slot = records.total + jnp.cumsum(used) - 1 - first
         slot = jnp.where(used & (slot >= 0), slot, method.capacity)
-        start, end = (column[pieces.segment] for column in segments.vertices)
+        start, end = segments.vertices[:, pieces.segment]
         rows = (
             jnp.stack([pixel, *places, start, end], axis=-1),
             jump,
             jnp.stack([area, rim_length], axis=-1),
-            outward[:, None] * jnp.stack(_motion(segments, pieces, found), axis=-1),
+            (outward * _motion(segments, pieces, found)).T,
         )
         columns = (
             old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
@@ -297,17 +289,25 @@ def _over_pieces(
     view: View,
     method: Method,
     records: Records,
-    add: Callable[[Array, Any, Any], Any],
+    adds: Sequence[Callable[[Array, Any, Any], Any]],
     start: Any,
 ) -> Any:
-    """Add up over all visible pieces: over those recorded, and what else there is by and by."""
+    """Add up over all visible pieces, once with each of `adds`.
 
-    def another(n: Array, total: Any) -> Any:
+    The pieces that are not recorded are found again, as many at a time as there are rows.
+    """
+    rounds = jnp.maximum((records.total + method.capacity - 1) // method.capacity, 1)
+
+    def another(n: Array) -> Records:
         more = collect(view, method, n * method.capacity).records
-        return _over_rows(more._replace(total=more.total - n * method.capacity), add, total)
+        return more._replace(total=more.total - n * method.capacity)
 
-    rounds = (records.total + method.capacity - 1) // method.capacity
-    return lax.fori_loop(1, rounds, another, _over_rows(records, add, start))
+    def step(n: Array, total: Any) -> Any:
+        rows = lax.cond(n % rounds == 0, lambda _: records, another, n % rounds)
+        branches = [lambda total, add=add: _over_rows(rows, add, total) for add in adds]
+        return lax.switch(n // rounds, branches, total)
+
+    return lax.fori_loop(0, len(adds) * rounds, step, start)
 
 
 def _push(
@@ -318,60 +318,61 @@ def _push(
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
     at the next pixel inwards stands for it.
     """
-    records, rims = blended.records, blended.rims
+    rim = blended.rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
 
-    def average(used: Array, rows: Any, total: Array) -> Array:
+    def average(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        averages, added = total
         integers, _, weights, _ = rows
         _, front, _, inner, _, _ = integers.T
-        return total.at[front].add(jnp.where(used, weights[:, 1], 0)[:, None] * colors[inner])
+        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
+        return averages.at[front].add(share[:, None] * colors[inner]), added
 
-    def add(used: Array, rows: Any, total: Array) -> Array:
+    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        averages, added = total
         integers, jump, weights, motion = rows
         pixel, front, beyond, _, start, end = integers.T
+        here, there = (jnp.where(rim[i, None], averages[i], colors[i]) for i in (front, beyond))
         moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
-        value = moved[:, None] * jump + weights[:, :1] * (colors[beyond] - colors[front])
-        return total.at[pixel].add(jnp.where(used[:, None], value, 0))
+        value = moved[:, None] * jump + weights[:, :1] * (there - here)
+        return averages, added.at[pixel].add(jnp.where(used[:, None], value, 0))
 
-    if method.shader is not None:
-        sums = _over_pieces(view, method, records, average, jnp.zeros_like(colors))
-        rim = (rims > 0)[:, None]
-        colors = jnp.where(rim, sums / jnp.where(rim, rims[:, None], 1), colors)
-    added = added + _cropped(colors, view.image.shape)
-    return _over_pieces(view, method, records, add, added)
+    adds = [add] if method.shader is None else [average, add]
+    start = jnp.zeros_like(colors), added
+    averages, added = _over_pieces(view, method, blended.records, adds, start)
+    return added + _cropped(jnp.where(rim[:, None], averages, colors), view.image.shape)
 
 
 def _pull(
     view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
 ) -> tuple[Array, Array]:
     """The transpose of `_push`, added to `points` and `colors`."""
-    records, rims = blended.records, blended.rims
+    rim = blended.rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
     own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
     own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
 
-    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        points, colors = total
+    def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        points, own, colors = total
         integers, jump, weights, motion = rows
         pixel, front, beyond, _, start, end = integers.T
         value = jnp.where(used[:, None], cotangent[pixel], 0)
         along = jnp.sum(value * jump, axis=1)[:, None]
         points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
         value = value * weights[:, :1]
-        return points, colors.at[beyond].add(value).at[front].add(-value)
+        return points, own.at[beyond].add(value).at[front].add(-value), colors
 
-    points, own = _over_pieces(view, method, records, add, (points, own))
-    if method.shader is None:
-        return points, colors + own
-    rim = (rims > 0)[:, None]
-    sums = jnp.where(rim, own / jnp.where(rim, rims[:, None], 1), 0)
-    own = jnp.where(rim, 0, own)
-
-    def average(used: Array, rows: Any, total: Array) -> Array:
+    def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        points, own, colors = total
         integers, _, weights, _ = rows
         _, front, _, inner, _, _ = integers.T
-        return total.at[inner].add(jnp.where(used, weights[:, 1], 0)[:, None] * sums[front])
+        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
+        return points, own, colors.at[inner].add(share[:, None] * own[front])
 
-    own = _over_pieces(view, method, records, average, own)
-    return points, colors + own
+    adds = [add] if method.shader is None else [add, average]
+    start = points, own, colors
+    points, own, colors = _over_pieces(view, method, blended.records, adds, start)
+    return points, colors + jnp.where(rim[:, None], 0, own)
 
 
 def _cropped(colors: Array, shape: tuple[int, ...]) -> Array:

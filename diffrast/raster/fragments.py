@@ -71,7 +71,7 @@ def rasterize(
     if faces.shape[0] == 0:
         raise ValueError("faces: wanted at least one face, got none")
     height, width = positive_int("height", height), positive_int("width", width)
-    positions_clip = stored_rows(positions_clip, faces)
+    positions_clip = stored_rows(positions_clip)
     face = visible_faces(
         lax.stop_gradient(positions_clip),
         faces,
@@ -113,7 +113,7 @@ def evaluate_fragments(
     total = edge[0] + edge[1] + edge[2]
     valid = covered & (total != 0)
     inverse_total = jnp.where(valid, 1, 0) / jnp.where(valid, total, 1)
-    barycentrics = stored([e * inverse_total for e in edge], faces)
+    barycentrics = stored([e * inverse_total for e in edge])
     depth = barycentrics[0] * w[0] + barycentrics[1] * w[1] + barycentrics[2] * w[2]
     positive = valid & (depth > 0)
     inverse_depth = jnp.where(positive, 1 / unit, 0) / jnp.where(positive, depth, 1)

@@ -1,0 +1,53 @@
+"""What may lie near a piece of an edge: pixels round it, and faces round faces."""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+
+def picked(values: Array, index: Array) -> Array:
+    """One row of each column."""
+    return jnp.take_along_axis(values, index[None], axis=0, mode="promise_in_bounds")[0]
+
+
+def pixel_at(
+    point: Float[Array, "2 n"], direction: Float[Array, "2 n"], distance: Array | float
+) -> Int[Array, " n"]:
+    """0 to 8: the pixel of the 3×3 at a distance from a point, which is given from the centre."""
+    column, row = jnp.floor(point + distance * direction + 0.5).clip(-1, 1).astype(jnp.int32)
+    return 4 + 3 * row + column
+
+
+def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:
+    """The values of the 3×3 pixels round each pixel of an image with a border, shape (9, n)."""
+    nine = jnp.arange(9)[:, None]
+    return image[row + nine // 3, column + nine % 3]
+
+
+def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "12 n"]:
+    """The faces up to two edges away from each of the two faces of an edge, but for the other."""
+    near = _across(face, face[::-1], neighbors)
+    far = _across(near, face[None], neighbors)
+    return jnp.concatenate([near.reshape(4, -1), far.reshape(8, -1)])
+
+
+def ring(face: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "9 n"]:
+    """The faces up to two edges away from a face."""
+    near = _next_to(face, neighbors)
+    far = _across(near, face[None], neighbors)
+    return jnp.concatenate([near, far.reshape(6, -1)])
+
+
+def _next_to(face: Array, neighbors: Array) -> Array:
+    return jnp.where(face >= 0, neighbors.T[:, jnp.maximum(face, 0)], -1)
+
+
+def _across(face: Array, without: Array, neighbors: Array) -> Array:
+    """The two faces next to each face that are not `without`, which is one of three or none."""
+    near = _next_to(face, neighbors)
+    return jnp.where(near[:2] == without, near[2], near[:2])
+
+
+def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
+    """The faces that are drawn, -1 in place of the others."""
+    return jnp.where((face >= 0) & drawn[jnp.maximum(face, 0)], face, -1)

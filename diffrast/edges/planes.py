@@ -1,0 +1,76 @@
+"""The planes of faces, evaluated at points of the screen.
+
+All in homogeneous coordinates x, y, w of the corners, so that faces may reach behind the camera,
+and relative to the point, so that small faces far from the image's origin lose nothing.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+
+Columns = list[Float[Array, "*n"]]
+Table = Float[Array, "4 V"]  # vertices in homogeneous pixel coordinates x, y, z, w
+
+
+def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) -> Array:
+    """x, y and w of the three corners of faces, shape (3, 3, *n)."""
+    return stored(pixels[jnp.array([0, 1, 3])][:, stored(faces.T[:, jnp.maximum(face, 0)])])
+
+
+def edge_values(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
+    """Three values that are positive inside of faces and linear on the screen, and 1/w.
+
+    1/w is -1 on faces seen edge-on. Multiplied by what they add up to, barycentric coordinates
+    become the values, up to one sign.
+    """
+    w = corners[2]
+    u, v = corners[0] - x * w, corners[1] - y * w
+    e = [
+        u[1] * v[2] - u[2] * v[1],
+        u[2] * v[0] - u[0] * v[2],
+        u[0] * v[1] - u[1] * v[0],
+    ]
+    volume = e[0] * w[0] + e[1] * w[1] + e[2] * w[2]
+    sign = jnp.where(volume < 0, -1, 1)
+    depth = jnp.where(volume == 0, -1, (e[0] + e[1] + e[2]) / jnp.where(volume == 0, 1, volume))
+    return stored(([value * sign for value in e], depth))
+
+
+def covers(values: Columns) -> Bool[Array, "*n"]:
+    """Whether faces cover a point, from their values there."""
+    return (values[0] >= 0) & (values[1] >= 0) & (values[2] >= 0)
+
+
+def locate(corners: Array, x: Array, y: Array) -> tuple[Bool[Array, "*n"], Columns]:
+    """Whether faces cover points, and the barycentric coordinates there on their planes."""
+    values, depth = edge_values(corners, x, y)
+    total = values[0] + values[1] + values[2]
+    inverse_total = 1 / jnp.where(total == 0, 1, total)
+    return covers(values) & (depth > 0), [value * inverse_total for value in values]
+
+
+def inverse_depth_slope(corners: Array, direction: Array) -> Array:
+    """Change of 1/w along a direction (2, n) on the screen; 0 on faces seen edge-on."""
+    first, one, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    gx = one[1] * other[2] - one[2] * other[1]
+    gy = one[2] * other[0] - one[0] * other[2]
+    gw = one[0] * other[1] - one[1] * other[0]
+    volume = first[0] * gx + first[1] * gy + first[2] * gw
+    safe = jnp.where(volume == 0, 1, volume)
+    return jnp.where(volume == 0, 0, (gx * direction[0] + gy * direction[1]) / safe)
+
+
+def area(corners: Array) -> Array:
+    """Twice the area of faces on the screen; infinite if they reach behind the camera."""
+    before = jnp.all(corners[2] > 0, axis=0)
+    x, y = corners[:2] / jnp.where(before, corners[2], 1)
+    twice = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+    return jnp.where(before, abs(twice), jnp.inf)
+
+
+def on_edge(edge: Int[Array, " n"], s: Array) -> Columns:
+    """Barycentric coordinates a part `s` of the way along an edge from corner i to j, 3 i + j."""
+    start, end = edge // 3, edge % 3
+    return [jnp.where(start == j, 1 - s, jnp.where(end == j, s, 0)) for j in range(3)]

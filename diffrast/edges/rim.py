@@ -1,0 +1,80 @@
+"""The surface just inside of an edge, as far as the edge's pixel reaches."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+from diffrast.edges.neighborhood import picked, pixel_at
+from diffrast.edges.planes import Columns, Table, corners_of, locate
+
+_SMALL = 1e-6  # keeps a ratio of lengths finite
+
+
+class Rim(NamedTuple):
+    """The surface in front of pieces, from the piece inwards as far as the pixel reaches."""
+
+    smooth: Bool[Array, " n"]  # whether this pixel and the next show the same smooth surface
+    inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards
+    depth: Float[Array, " n"]  # how far the pixel reaches,
+    first: Float[Array, " n"]  # how far the face at the edge does, if that is less,
+    distance: Float[Array, " n"]  # and how far away the centre of the next pixel is
+    bend: tuple[Int[Array, " n"], Columns]  # face and barycentrics where that face ends
+    far: tuple[Int[Array, " n"], Columns]  # and where the pixel ends
+    single: Bool[Array, " n"]  # whether one face covers what lies between
+
+
+def look_inwards(
+    front: Int[Array, " n"],
+    thickness: Float[Array, " n"],
+    pictured: Int[Array, "9 n"],
+    patches: Int[Array, " F"],
+    front_look: Int[Array, " n"],
+    middle: Float[Array, "2 n"],
+    inward: Float[Array, "2 n"],
+    centre: Float[Array, "2 n"],
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+) -> Rim:
+    """What the faces in front show from the middle of pieces inwards.
+
+    Args:
+        front: face in front.
+        thickness: how far it reaches.
+        pictured: faces at the 3×3 pixels.
+        patches: of each face.
+        front_look: see `Side`.
+        middle: of the piece, from the pixel's centre.
+        inward: unit normal towards the face in front.
+        centre: of the pixel, on the screen.
+        faces: corners of faces.
+        pixels: see `to_pixels`.
+    """
+    exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
+    depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
+    inner = stored(pixel_at(middle, inward, depth + 0.5))
+    step = jnp.stack([inner % 3 - 1, inner // 3 - 1])
+    distance = jnp.sum((step - middle) * inward, axis=0)
+    next_face = stored(picked(pictured, inner))
+    ours = jnp.stack([picked(pictured, front_look), next_face])
+    same = (ours >= 0) & (patches[jnp.maximum(ours, 0)] == patches[jnp.maximum(front, 0)])
+
+    first = jnp.minimum(thickness, depth)
+    beyond = jnp.where(thickness >= depth, front, next_face)
+    face = jnp.stack([front, beyond])
+    x, y = (centre + middle)[:, None] + jnp.stack([first, depth]) * inward[:, None]
+    covered, at = locate(corners_of(face, faces, pixels), x, y)
+    bend = [jnp.clip(b[0], 0, 1) for b in at]
+    total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
+    return Rim(
+        smooth=(front >= 0) & same[0] & same[1],
+        inner=inner,
+        depth=depth,
+        first=first,
+        distance=jnp.maximum(distance, depth + 0.25),
+        bend=(front, [b / total for b in bend]),
+        far=(beyond, [b[1] for b in at]),
+        single=covered[1],
+    )
