@@ -19,6 +19,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
+from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.pieces import (
     EDGES_AT_ONCE,
@@ -149,7 +150,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             return jnp.split(jnp.stack(shader(scene, face, barycentrics), axis=-1), len(points))
 
         places = [place(i) for i in (found.front.look, found.beyond.look, rim.inner)]
-        near, behind, inner = (flat[i] for i in places)
+        near, behind, inner = stored([flat[i] for i in places])
         plain = view.background.ndim == 1
         bare = view.background if plain else view.background.reshape(-1, channels)[place(4)]
         behind = jnp.where((found.beyond.face == BACKGROUND)[:, None], bare, behind)
@@ -173,9 +174,10 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
                 area[:, None] * (behind - near) + length[:, None] * mean,
                 area[:, None] * jump,
             )
+        jump, value, front, behind = stored((jump, value, front, behind))
         size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
         used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
-        pixel = jnp.where(used, row * width + column, 0)
+        pixel = stored(jnp.where(used, row * width + column, 0))
         added = total.added.at[pixel].add(jnp.where(used[:, None], value, 0))
         held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
         low, high = total.range
@@ -192,7 +194,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             jnp.stack([pixel, *places, start, end], axis=-1),
             jump,
             jnp.stack([area, rim_length], axis=-1),
-            (outward * _motion(segments, pieces, found)).T,
+            stored(outward * _motion(segments, pieces, found)).T,
         )
         columns = (
             old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)

@@ -20,7 +20,7 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.raster.fixed_point import CULLED, group_by_class
 
-EDGES_AT_ONCE = 256
+EDGES_AT_ONCE = 512
 PIECES_AT_ONCE = 512
 _EDGE_ON = 8  # roundings in the volume of a face
 
@@ -178,7 +178,9 @@ def cut(
 ) -> Pieces:
     """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their counts."""
     number = first_piece + jnp.arange(PIECES_AT_ONCE)
-    segment = jnp.searchsorted(ends, number, side="right", method="compare_all")
+    # As many segments end before or at each piece's number.
+    ended = jnp.zeros(PIECES_AT_ONCE, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
+    segment = jnp.cumsum(ended.add(1, mode="drop"))
     exists = segment < ends.shape[0]
     segment = stored(jnp.minimum(segment, ends.shape[0] - 1))
     k = number - (ends - segments.parts)[segment]

@@ -135,8 +135,11 @@ def look(
     values, depth = edge_values(candidates, x, y)
     behind = foreign & covers(values) & (depth <= near * (1 + _TOLERANCE))
     candidate = stored(jnp.where(behind, depth, 0))
-    best = stored(jnp.argmax(candidate, axis=0))
-    found = fold & (jnp.max(candidate, axis=0) > 0)
+    nearest = stored(jnp.max(candidate, axis=0))
+    number = jnp.arange(candidate.shape[0])[:, None]
+    best = stored(jnp.min(jnp.where(candidate == nearest, number, number.size), axis=0))
+    best = jnp.minimum(best, number.size - 1)
+    found = fold & (nearest > 0)
     beyond = jnp.where(fold, jnp.where(found, picked(around, best), -1), other)
     beyond = stored(beyond)
     _, at_beyond = locate(corners_of(beyond, faces, pixels), x, y)
