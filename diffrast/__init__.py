@@ -7,6 +7,7 @@ The way of the data::
                          coverage, 1/z resolve     raster: which face each pixel sees
                          interpolation             interpolate: attributes of the visible points
     lights, materials ─► shading                   light, material, shade
+                         edges                     edges: exact areas, and their derivative
                          image ──► loss ──► fit    render, fit
 
 `render(scene, camera, settings)` runs all of it; each stage can be used alone, with a JAX function
@@ -23,6 +24,7 @@ from diffrast.camera import clip_to_pixel as clip_to_pixel
 from diffrast.camera import stack_cameras as stack_cameras
 from diffrast.camera import viewpoint as viewpoint
 from diffrast.camera import world_to_clip as world_to_clip
+from diffrast.edges import antialias as antialias
 from diffrast.files import load_bezier as load_bezier
 from diffrast.files import load_image as load_image
 from diffrast.files import load_mesh as load_mesh

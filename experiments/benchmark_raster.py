@@ -6,11 +6,13 @@ Scenes: spheres of 5,120 and 81,920 faces, 2,000 large random triangles in about
 height field of 131,072 faces. Each picture is checked before it is timed: every face id that the
 rasteriser reports must cover its pixel. The minimum and the median over the repeats are printed;
 `rasterize` is face ids, barycentrics and 1/w, `ids` the selection alone, `shade` deferred Phong
-shading with a highlight of a fully covered image, `render` everything. Compile times are of the
+shading with a highlight of a fully covered image, `render` everything, with edges and without.
+Compile times are of the
 first call in a fresh process state (tracing and compiling, not running).
 """
 
 import argparse
+import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -91,7 +93,8 @@ def check(positions_clip: jax.Array, faces: jax.Array, fragments: dr.Fragments) 
 
 def run(size: int = 512, repeats: int = 30) -> dict[str, dict[str, Any]]:
     """Time every scene; returns the figures by scene and stage."""
-    settings = dr.RenderSettings(height=size, width=size)
+    with_edges = dr.RenderSettings(height=size, width=size)
+    without = dataclasses.replace(with_edges, antialias=False)
     results: dict[str, dict[str, Any]] = {}
     for name, (mesh, camera) in scenes().items():
         positions_clip = dr.world_to_clip(camera, mesh.vertices)
@@ -116,8 +119,11 @@ def run(size: int = 512, repeats: int = 30) -> dict[str, dict[str, Any]]:
                 mesh.faces,
                 repeats=repeats,
             ),
+            "render, no edges": measure(
+                lambda s, c: dr.render(s, c, without), scene, camera, repeats=repeats
+            ),
             "render": measure(
-                lambda s, c: dr.render(s, c, settings), scene, camera, repeats=repeats
+                lambda s, c: dr.render(s, c, with_edges), scene, camera, repeats=repeats
             ),
         }
     results["covered image"] = {"shade": measure(*shading(size), repeats=repeats)}

@@ -21,6 +21,7 @@ errors by the angle of the start and by the renders used.
 
 import argparse
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,10 +33,9 @@ import optax
 from common import DEFAULT_TARGET, View, load_problem, pyplot, render_view, save_json
 from fitting import (
     RADIUS,
-    RENDERS_PER_DERIVATIVE,
     Level,
-    difference_steps,
     fit_level,
+    moving,
     residual_function,
 )
 from jax import Array
@@ -54,7 +54,7 @@ CRITERION = {"rotation_degrees": 0.2, "eye_percent": 0.5}  # a tenth of a pixel 
 
 def levels_for(size: int, steps: int) -> list[Level]:
     """Blur by a sixteenth of the picture, then by one pixel, with all seven parameters."""
-    return [Level(1, 4, size / 16, steps, False), Level(1, 4, 1.0, steps, True)]
+    return [Level(1, 4, size / 16, steps, False), Level(1, 16, 1.0, steps, True)]
 
 
 def random_camera(
@@ -74,17 +74,21 @@ def fit_with_lm(start: Start, target: Array, levels: list[Level]) -> tuple[Any, 
     params, renders = {"camera": jnp.zeros(CAMERA_PARAMETERS)}, 0
     for level in levels:
         result = fit_level(start, target, params, level)
-        params, renders = result.params, renders + result.renders * RENDERS_PER_DERIVATIVE
+        params, renders = result.params, renders + result.renders
     return params, renders
 
 
-def adam_loss(
-    params: Any, start: Start, target: Array, blur: Array, steps: Array, scale: Array
-) -> Array:
+@functools.cache
+def adam_loss(height: int, width: int, samples: int) -> Callable[..., Array]:
     """Mean square of the residuals, relative to `scale`."""
-    height, width = target.shape[:2]
-    residuals = residual_function(height, width, 4, RADIUS)
-    return jnp.mean(residuals(params, start, target, blur, steps) ** 2) / scale
+    residuals = residual_function(height, width, samples, RADIUS)
+
+    def loss(
+        params: Any, start: Start, target: Array, blur: Array, moving: Array, scale: Array
+    ) -> Array:
+        return jnp.mean(residuals(params, start, target, blur, moving) ** 2) / scale
+
+    return loss
 
 
 def fit_with_adam(
@@ -93,15 +97,14 @@ def fit_with_adam(
     """Return parameters and renders of a fit by Adam, one optimizer for each level."""
     params, renders = {"camera": jnp.zeros(CAMERA_PARAMETERS)}, 0
     for level, optimizer in zip(levels, optimizers, strict=True):
-        steps = difference_steps(level, target.shape[0])
         result = dr.fit.minimize(
-            adam_loss,
+            adam_loss(*target.shape[:2], level.samples),
             params,
-            args=(start, target, jnp.float32(level.blur), steps, jnp.mean(target**2)),
+            args=(start, target, jnp.float32(level.blur), moving(level), jnp.mean(target**2)),
             optimizer=optimizer,
             steps=level.steps,
         )
-        params, renders = result.params, renders + result.renders * RENDERS_PER_DERIVATIVE
+        params, renders = result.params, renders + result.renders
     return params, renders
 
 
@@ -122,7 +125,7 @@ def run(
     truth = load_problem(DEFAULT_TARGET).truth
     assert truth is not None
     mesh = dr.shapes.teapot(divisions)
-    target = render_view(mesh, truth, size, size, samples=16)
+    target = render_view(mesh, truth, size, size, samples=64)
     optimizers = [
         optax.adam(optax.cosine_decay_schedule(rate, adam_steps)) for rate in (0.03, 0.005)
     ]

@@ -1,9 +1,7 @@
 """The fit of cameras, lights and materials to a picture, coarse to fine.
 
-The derivative of `diffrast.render` is that of the faces that are seen; what an outline does when
-the camera moves is not part of it. So the derivative by the camera is taken here by central
-differences of pictures, two renders for each of its seven parameters; that by lights and materials
-is the renderer's own, in forward mode.
+The residuals are plain differences of pictures, blurred at the coarse levels; their derivative by
+all parameters is the renderer's own, in forward mode: one render and one pass for each parameter.
 """
 
 import dataclasses
@@ -42,7 +40,6 @@ from parameters import (
 import diffrast as dr
 
 RADIUS = 32  # pixels to either side that blurring looks at
-RENDERS_PER_DERIVATIVE = 1 + 2 * CAMERA_PARAMETERS
 
 
 class Level(NamedTuple):
@@ -72,58 +69,26 @@ def coarse_to_fine(height: int, width: int) -> list[Level]:
     ]
     shrink = max(small_enough, default=1)
     unit = min(height, width) / shrink / 128
-    levels = [Level(shrink, 4, 8 * unit, 20, False), Level(shrink, 4, 2 * unit, 20, True)]
+    levels = [Level(shrink, 1, 8 * unit, 20, False), Level(shrink, 1, 2 * unit, 20, True)]
     return [*levels, Level(1, 4, 0.0 if shrink > 1 else 0.5, 10, True)]
 
 
 # Residuals ----------------------------------------------------------------------------------------
 
 
-def _plain_picture(
-    size: tuple[int, int, int], camera: Array, appearance: Any, start: Start, steps: Array
-) -> Array:
-    view = View(moved_camera(start, camera), *appearance, start.background)
-    return render_view(start.mesh, view, *size)
-
-
-# With the derivative by the camera from differences of the length `steps`, zero for parameters
-# that are held.
-_picture = jax.custom_jvp(_plain_picture, nondiff_argnums=(0,))
-
-
-@_picture.defjvp
-def _picture_jvp(size: Any, primals: Any, tangents: Any) -> tuple[Array, Array]:
-    camera, appearance, start, steps = primals
-    image, change = jax.jvp(
-        lambda a: _plain_picture(size, camera, a, start, steps), (appearance,), (tangents[1],)
-    )
-
-    # One loop over all moved cameras, so that one renderer is compiled for them.
-    moves = jnp.diag(steps)
-    moved = jax.lax.map(
-        lambda move: _plain_picture(size, camera + move, appearance, start, steps),
-        jnp.concatenate([moves, -moves]),
-    )
-    lengths = 2 * steps[:, None, None, None]
-    differences = moved[:CAMERA_PARAMETERS] - moved[CAMERA_PARAMETERS:]
-    columns = jnp.where(lengths > 0, differences / jnp.where(lengths > 0, lengths, 1), 0)
-    return image, change + jnp.tensordot(tangents[0], columns, 1)
-
-
 @functools.cache
 def residual_function(height: int, width: int, samples: int, radius: int) -> Any:
     """Residuals of a level, always the same function for the same numbers: it compiles once.
 
-    Called as `residuals(params, start, target, blur, steps)`.
+    Called as `residuals(params, start, target, blur, moving)`; where `moving` is 0 and not 1, the
+    camera's parameter has no derivative.
     """
 
-    def residuals(params: Params, start: Start, target: Array, blur: Array, steps: Array) -> Array:
-        appearance = appearance_of(start, params)
-        size = (height, width, samples)
-        if "camera" in params:
-            image = _picture(size, params["camera"], appearance, start, steps)
-        else:
-            image = _plain_picture(size, jnp.zeros(CAMERA_PARAMETERS), appearance, start, steps)
+    def residuals(params: Params, start: Start, target: Array, blur: Array, moving: Array) -> Array:
+        camera = params.get("camera", jnp.zeros(CAMERA_PARAMETERS))
+        camera = jnp.where(moving > 0, camera, jax.lax.stop_gradient(camera))
+        view = View(moved_camera(start, camera), *appearance_of(start, params), start.background)
+        image = render_view(start.mesh, view, height, width, samples)
         return dr.fit.gaussian_blur(image - target, blur, radius=radius)
 
     return residuals
@@ -141,8 +106,8 @@ class Fit:
         view: what they stand for.
         trace: for the start and every step: level, renders so far, root mean square residual, and
             errors where the truth is known.
-        renders: pictures rendered, those of differences included.
-        derivatives: forward derivative passes by lights and material.
+        renders: pictures rendered.
+        derivatives: forward derivative passes, one for each parameter and picture.
         seconds: wall-clock time, compilation included.
     """
 
@@ -172,14 +137,9 @@ class Patience:
         return loss > 0.999 * self._losses[-1 - self._steps]
 
 
-def difference_steps(level: Level, height: int) -> Array:
-    """How far the camera's parameters move for differences: about as far as the picture is blurred.
-
-    Half a pixel or half the blur to either side; perspective moves outlines less.
-    """
-    pixel = 2 * level.shrink / height
-    step = pixel * max(0.5, 0.5 * level.blur)
-    return jnp.asarray([step] * 6 + [4 * step * level.perspective], jnp.float32)
+def moving(level: Level) -> Array:
+    """Which of the camera's parameters take part, as ones and zeros."""
+    return jnp.ones(CAMERA_PARAMETERS).at[-1].set(float(level.perspective))
 
 
 def fit(
@@ -195,10 +155,7 @@ def fit(
     start = start_of(problem.mesh, problem.start)
     trace: list[dict[str, float]] = []
     renders = derivatives = 0
-    per_evaluation = RENDERS_PER_DERIVATIVE if "camera" in params else 1
-    columns = sum(
-        leaf.size for key in params if key != "camera" for leaf in jax.tree.leaves(params[key])
-    )
+    columns = sum(leaf.size for leaf in jax.tree.leaves(params))
     for number, level in enumerate(levels or coarse_to_fine(height, width)):
         result = fit_level(start, problem.target, params, level, progress=progress)
         for step, (loss, at) in enumerate(
@@ -206,14 +163,14 @@ def fit(
         ):
             entry: dict[str, float] = {
                 "level": number,
-                "renders": renders + (step + 1) * per_evaluation,
+                "renders": renders + step + 1,
             }
             entry["residual"] = math.sqrt(2 * loss * level.shrink**2 / problem.target.size)
             if problem.truth is not None:
                 entry |= view_errors(view_of(start, at), problem.truth, float(start.size))
             trace.append(entry)
         params = result.params
-        renders += result.renders * per_evaluation
+        renders += result.renders
         derivatives += result.renders * columns
     return Fit(
         params=params,
@@ -235,7 +192,7 @@ def fit_level(
     return dr.fit.least_squares(
         residual_function(height, width, level.samples, radius),
         params,
-        args=(start, small, jnp.float32(level.blur), difference_steps(level, target.shape[0])),
+        args=(start, small, jnp.float32(level.blur), moving(level)),
         steps=level.steps,
         damping=0.1,
         tolerance=1e-4,

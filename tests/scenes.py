@@ -13,8 +13,8 @@ VIEW = {"fov_y": 0.65, "aspect": WIDTH / HEIGHT, "near": 1.0, "far": 15.0}
 BACKGROUND = (0.1, 0.2, 0.3)
 
 
-def settings(**options):
-    return dr.RenderSettings(height=HEIGHT, width=WIDTH, **options)
+def settings(antialias=False, **options):
+    return dr.RenderSettings(height=HEIGHT, width=WIDTH, antialias=antialias, **options)
 
 
 # ---------------------------------------------------------------------------------------- scenes

@@ -156,3 +156,78 @@ def test_edges_cost_nothing_where_they_are_off():
     text = dr.render.lower(scene, camera(), off).as_text(debug_info=True)
     assert "/edges/" not in text
     assert "/edges/" in dr.render.lower(scene, camera(), SETTINGS).as_text(debug_info=True)
+
+
+# The stage alone ----------------------------------------------------------------------------------
+
+COLORS = 0.5 + 0.5 * jnp.sin(2 * MESH.vertices)  # of the vertices; the background is white
+
+
+def own_picture(vertices, height, width, **options):
+    clip = dr.world_to_clip(camera(), vertices)
+    size = {"height": height, "width": width}
+    fragments = dr.rasterize(clip, MESH.faces, border=1 if options else 0, **size)
+    image = dr.interpolate(COLORS, MESH.faces, fragments)
+    image = jnp.where(fragments.face[..., None] >= 0, image, 1.0)
+    if not options:
+        return image
+    return dr.antialias(image, clip, MESH.faces, fragments.face, background=1.0, **options)
+
+
+def colors_at(colors, face, barycentrics):
+    return jnp.einsum("njc,nj->nc", colors[MESH.faces[face]], barycentrics)
+
+
+@pytest.mark.parametrize(
+    ("options", "image_error", "derivative_error"),
+    [
+        ({"shader": colors_at, "data": COLORS, "topology": MESH.topology}, 0.0015, 0.03),
+        ({"topology": None}, 0.005, 0.1),
+    ],
+)
+def test_a_picture_of_ones_own_gets_its_edges(options, image_error, derivative_error):
+    """Against many samples a pixel, and the derivative against differences of these."""
+    side, step, shift = 16, 0.02, jnp.array([1.0, 0.3, 0.0])
+    weights = jnp.sin(jnp.arange(40.0)[:, None, None] / 10 + jnp.arange(48.0)[:, None] / 14)
+
+    @jax.jit
+    def sampled(s):
+        fine = own_picture(MESH.vertices + s * shift, 40 * side, 48 * side)
+        return fine.reshape(40, side, 48, side, 3).mean(axis=(1, 3))
+
+    @jax.jit
+    def with_edges(s):
+        return jax.jvp(
+            lambda s: own_picture(MESH.vertices + s * shift, 40, 48, **options), (s,), (1.0,)
+        )
+
+    image, change = with_edges(0.0)
+    assert jnp.mean(jnp.abs(image - sampled(0.0))) < image_error
+    truth = jnp.sum(weights * (sampled(step) - sampled(-step))) / (2 * step)
+    assert abs(jnp.sum(weights * change) - truth) < derivative_error * abs(truth)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image": jnp.zeros((5, 6))}, "image: wanted shape"),
+        (
+            {"image": jnp.zeros((2, 6, 3)), "face": jnp.zeros((2, 6), int)},
+            "image: wanted a channel",
+        ),
+        ({"face": jnp.zeros((5, 5), int)}, "face: wanted shape"),
+        ({"face": jnp.full((5, 6), 99999)}, "face: wanted indices"),
+        ({"background": (1.0, 2.0)}, "background: wanted"),
+        ({"topology": dr.shapes.cube().topology}, "topology: wanted that of"),
+        ({"creases": "some"}, "creases: wanted one of"),
+    ],
+)
+def test_bad_arguments_of_the_stage_are_named(change, message):
+    arguments = {
+        "image": jnp.zeros((5, 6, 3)),
+        "positions_clip": jnp.ones((len(MESH.vertices), 4)),
+        "faces": MESH.faces,
+        "face": jnp.zeros((5, 6), int),
+    }
+    with pytest.raises(ValueError, match=message):
+        dr.antialias(**(arguments | change))

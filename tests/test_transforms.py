@@ -13,8 +13,11 @@ TANGENT = jnp.array([1.0, 2.0, 3.0])
 
 @pytest.fixture(scope="module")
 def image():
+    return renderer(dr.RenderSettings(height=24, width=32))
+
+
+def renderer(settings):
     mesh = dr.shapes.icosphere(1)
-    settings = dr.RenderSettings(height=24, width=32)
     scene = dr.Scene(
         objects=[dr.Object(mesh)],
         lights=[dr.PointLight(position=(2, 2, 3))],
@@ -72,6 +75,16 @@ def test_grad_of_scan_with_checkpoints(loss, gradients):
 
 
 def test_hessian_vector_product(loss):
+    product = jax.jit(lambda e, t: jax.jvp(jax.grad(loss), (e,), (t,))[1])(EYES[1], TANGENT)
+    assert np.all(np.isfinite(product))  # without the second derivative of what is visible
+
+
+def test_hessian_vector_product_of_the_shading():
+    image = renderer(dr.RenderSettings(height=24, width=32, antialias=False))
+
+    def loss(eye):
+        return jnp.mean(image(eye) ** 2)
+
     with jax.enable_x64(True):
         eye, tangent = jnp.asarray(EYES[1], jnp.float64), jnp.asarray(TANGENT, jnp.float64)
         gradient = jax.jit(jax.grad(loss))

@@ -1,5 +1,6 @@
 """Anti-aliased edges, and the derivative of what is visible where."""
 
+from diffrast.edges.antialias import antialias as antialias
 from diffrast.edges.antialias import antialias_image as antialias_image
 from diffrast.edges.blend import Shader as Shader
 from diffrast.edges.blend import View as View

@@ -1,16 +1,127 @@
 """The stage that gives an image its edges; see `blend` for the method."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from diffrast import _check
+from diffrast._check import ArrayInput
+from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Method, Shader, View, apply_linear, collect, linear_zeros
 from diffrast.edges.pieces import to_pixels
+
+CREASES = ("none", "seams", "all")
+
+PointShader = Callable[[Any, Int[Array, " n"], Float[Array, "n 3"]], Float[Array, "n channels"]]
+
+
+def antialias(
+    image: ArrayInput,
+    positions_clip: ArrayInput,
+    faces: ArrayInput,
+    face: Int[Array, "height_with_border width_with_border"],
+    *,
+    background: ArrayInput = 0.0,
+    topology: Topology | None = None,
+    creases: str = "seams",
+    cull_backfaces: bool = False,
+    shader: PointShader | None = None,
+    data: Any = None,
+) -> Float[Array, "height width channels"]:
+    """Give an image that was shaded pixel by pixel its edges, in value and in derivative.
+
+    Where an outline, a boundary or a crease passes through a pixel, both sides get their exact
+    share of its area, and the result is differentiable in `positions_clip` through that share: this
+    is how geometry has a derivative through what is visible. Everything is drawn with a border of
+    one pixel, so that edges that leave the image lose nothing::
+
+        fragments = dr.rasterize(positions_clip, mesh.faces, height=h, width=w, border=1)
+        image = my_shading(fragments)                       # (h + 2, w + 2, channels)
+        image = dr.antialias(image, positions_clip, mesh.faces, fragments.face,
+                             topology=mesh.topology)        # (h, w, channels)
+
+    What comes before must shade each pixel by itself, as any function of what it sees: colours of
+    neighbouring pixels are taken for those of the surfaces there. Blur, resample or denoise
+    afterwards. Number and meaning of the channels are free.
+
+    Args:
+        image: (height + 2, width + 2, channels), differentiable.
+        positions_clip: (V, 4) as given to `rasterize`, differentiable; its second derivative
+            through visibility is left out.
+        faces: (F, 3) likewise.
+        face: (height + 2, width + 2) face ids, -1 on the background, as `rasterize` gives them.
+        background: (channels,) or a number: what empty pixels show; or a picture like `image`.
+        topology: `Mesh.topology`. Without it edges are found in each call, by sorting, and joined
+            where clip positions are equal.
+        creases: between which faces, both in view, colours may jump: those that have vertices of
+            their own at the common edge ("seams"), any ("all", for flat shading), or "none".
+        cull_backfaces: as given to `rasterize`.
+        shader: colours of points on faces, `shader(data, face, barycentrics)`, for exact colours at
+            the edges; it needs no derivative. Without it those of the pixels beside them are
+            taken: several times the error where colours change from pixel to pixel.
+        data: a tree of arrays for the shader, which cannot use traced arrays otherwise.
+
+    Returns:
+        (height, width, channels).
+
+    Raises:
+        ValueError: for wrong shapes, indices out of range and an unknown choice.
+    """
+    image = _check.float_array("image", image, ("height + 2", "width + 2", "channels"))
+    positions_clip = _check.float_array("positions_clip", positions_clip, ("V", 4))
+    faces = _check.index_array("faces", faces, ("F", 3), bound=positions_clip.shape[0])
+    face = _check.index_array("face", face, image.shape[:2], minimum=-1, bound=faces.shape[0])
+    if min(image.shape) < 1 or min(image.shape[:2]) < 3:
+        raise ValueError(
+            "image: wanted a channel and a border of one pixel round at least one pixel,"
+            f" got shape {image.shape}"
+        )
+    _check.one_of("creases", creases, CREASES)
+    background = _check.float_array("background", background).astype(image.dtype)
+    if background.shape != image.shape:
+        if background.shape not in ((), image.shape[2:]):
+            raise ValueError(
+                f"background: wanted a number or shape {image.shape[2:]} or {image.shape}, got"
+                f" {background.shape}"
+            )
+        background = jnp.broadcast_to(background, image.shape[2:])
+    if topology is None:
+        topology = traced_topology(positions_clip, faces)
+    elif topology.patches.shape != faces.shape[:1]:
+        raise ValueError(
+            f"topology: wanted that of {faces.shape[0]} faces, got one of"
+            f" {topology.patches.shape[0]}"
+        )
+    seam = jnp.asarray(topology.edges.seam)
+    if creases == "all":
+        topology = topology._replace(patches=jnp.arange(faces.shape[0]))
+    view = View(
+        positions_clip=positions_clip,
+        faces=faces,
+        turned=None,
+        topology=topology,
+        apart=seam if creases == "seams" else jnp.full_like(seam, creases == "all"),
+        face_image=face,
+        image=image,
+        background=background,
+        scene=data,
+    )
+    own = None if shader is None else _by_columns(shader)
+    return antialias_image(view, shader=own, cull_backfaces=bool(cull_backfaces))
+
+
+def _by_columns(shader: PointShader) -> Shader:
+    def shade(data: Any, face: Array, barycentrics: list[Array]) -> list[Array]:
+        colors = shader(data, face, jnp.stack(barycentrics, axis=-1))
+        return [colors[:, c] for c in range(colors.shape[1])]
+
+    return shade
 
 
 def antialias_image(

@@ -382,7 +382,11 @@ def _cropped(colors: Array, shape: tuple[int, ...]) -> Array:
 
 
 def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
-    """Zeros that depend on a tangent: the system is to be linear in all parts of its right side."""
+    """Zeros that depend on a tangent.
+
+    The system below has to depend on all parts of its right side, and what comes out on all parts
+    of its solution: derivatives of it and of its transpose, again, leave out none.
+    """
     return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
 
 
@@ -408,4 +412,6 @@ def apply_linear(
         return *pull(view, blended, *b), b[2]
 
     nothing = linear_zeros(_cropped(colors, view.image.shape).shape, colors)
-    return lax.custom_linear_solve(matvec, (points, colors, nothing), solve, transpose_solve)[2]
+    right = points, colors, nothing
+    points, colors, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
+    return out + linear_zeros(out.shape, points) + linear_zeros(out.shape, colors)

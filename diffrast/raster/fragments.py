@@ -9,6 +9,7 @@ coordinate of corner 0, and so on in turn, for every sign of w. Nothing is divid
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
@@ -42,6 +43,7 @@ def rasterize(
     height: int,
     width: int,
     cull_backfaces: bool = False,
+    border: int = 0,
 ) -> Fragments:
     """Find the nearest face at every pixel centre, and where on it the pixel looks.
 
@@ -58,9 +60,11 @@ def rasterize(
             of the left and i + 0.5 below the top border.
         width: columns of the image.
         cull_backfaces: drop faces that turn clockwise to the viewer.
+        border: pixels to see beyond each side of the image; `antialias` wants one.
 
     Returns:
-        The fragments. Barycentrics and inverse depth are differentiable in `positions_clip`.
+        The fragments, of height + 2 border rows and width + 2 border columns. Barycentrics and
+        inverse depth are differentiable in `positions_clip`.
 
     Raises:
         ValueError: for wrong shapes, indices out of range, no faces, and clip positions that are
@@ -71,16 +75,27 @@ def rasterize(
     if faces.shape[0] == 0:
         raise ValueError("faces: wanted at least one face, got none")
     height, width = positive_int("height", height), positive_int("width", width)
-    positions_clip = stored_rows(positions_clip)
+    border = positive_int("border", border, minimum=0)
+    positions_clip = stored_rows(with_border(positions_clip, height, width, border))
     face = visible_faces(
         lax.stop_gradient(positions_clip),
         faces,
-        height=height,
-        width=width,
+        height=height + 2 * border,
+        width=width + 2 * border,
         cull_backfaces=bool(cull_backfaces),
     )
     barycentrics, inverse_depth = evaluate_fragments(positions_clip, faces, face)
     return Fragments(face=face, barycentrics=assemble(barycentrics), inverse_depth=inverse_depth)
+
+
+def with_border(
+    positions_clip: Float[Array, "V 4"], height: int, width: int, border: int
+) -> Float[Array, "V 4"]:
+    """Clip positions for an image that is wider by `border` pixels on each side."""
+    if border == 0:
+        return positions_clip
+    scale = np.array([width / (width + 2 * border), height / (height + 2 * border), 1, 1])
+    return positions_clip * scale.astype(positions_clip.dtype)
 
 
 def evaluate_fragments(
