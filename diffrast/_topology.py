@@ -54,11 +54,14 @@ class Topology(NamedTuple):
         neighbors: the faces across the three edges of each face, −1 where there is none.
         patches: a number for each face, the same for faces that hang together by shared vertices,
             over which attributes are continuous.
+        bodies: the same for faces that hang together by vertices at the same place; None if all
+            do.
     """
 
     edges: Edges
     neighbors: Int[Any, "faces 3"]
     patches: Int[Any, "faces"]
+    bodies: Int[Any, "faces"] | None
 
 
 class HalfEdges(NamedTuple):
@@ -141,14 +144,6 @@ def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
         np.maximum(beyond, 0)[:, None], np.stack([packed[:, 1] // 3, packed[:, 1] % 3], 1)
     ]
     seam = (beyond >= 0) & np.any(other != adjacency.edges, axis=1)
-    labels = np.arange(len(positions), dtype=np.int32)
-    while True:
-        before, labels = labels, labels.copy()
-        roots = before[faces]
-        np.minimum.at(labels, roots, np.min(roots, axis=1)[:, None])
-        labels = labels[labels]
-        if np.array_equal(labels, before):
-            break
     neighbors = np.full(faces.shape, -1, np.int32)
     for side in range(2):
         paired = beyond >= 0
@@ -157,7 +152,21 @@ def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
             paired, 1 - side
         ]
     edges = Edges(adjacency.edge_faces, packed, seam)
-    return Topology(edges, neighbors, labels[faces[:, 0]])
+    bodies = _joined(welded[faces], len(positions))
+    whole = bool(np.all(bodies == bodies[0]))
+    return Topology(edges, neighbors, _joined(faces, len(positions)), None if whole else bodies)
+
+
+def _joined(faces: np.ndarray, count: int) -> np.ndarray:
+    """The least of the vertices that hang together with each face."""
+    labels = np.arange(count, dtype=np.int32)
+    while True:
+        before, labels = labels, labels.copy()
+        roots = before[faces]
+        np.minimum.at(labels, roots, np.min(roots, axis=1)[:, None])
+        labels = labels[labels]
+        if np.array_equal(labels, before):
+            return labels[faces[:, 0]]
 
 
 def traced_topology(positions: Array, faces: Array) -> Topology:
@@ -191,14 +200,6 @@ def traced_topology(positions: Array, faces: Array) -> Topology:
     seam = paired & ((ends[0] != others[0]) | (ends[1] != others[1]))
     columns = [jnp.where(first, one // 3, -1), jnp.where(paired, other // 3, -1)]
 
-    def join(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        labels, _ = state
-        roots = labels[faces]
-        joined = labels.at[roots].min(jnp.min(roots, axis=1)[:, None])
-        return joined[joined], labels
-
-    labels = jnp.arange(positions.shape[0], dtype=jnp.int32) + 0 * faces[0, 0]
-    labels, _ = lax.while_loop(lambda s: jnp.any(s[0] != s[1]), join, (labels, labels - 1))
     edges = Edges(
         jnp.stack(columns, axis=1).astype(jnp.int32),
         jnp.stack([corner, opposite], axis=1).astype(jnp.int32),
@@ -209,7 +210,22 @@ def traced_topology(positions: Array, faces: Array) -> Topology:
         sides = 3 - edges.corners[:, side] // 3 - edges.corners[:, side] % 3
         own = jnp.where(paired, edges.faces[:, side], count)
         neighbors = neighbors.at[own, sides].set(edges.faces[:, 1 - side], mode="drop")
-    return Topology(edges, neighbors, labels[faces[:, 0]])
+    patches, bodies = (_traced_joined(f, positions.shape[0]) for f in (faces, welded))
+    return Topology(edges, neighbors, patches, bodies)
+
+
+def _traced_joined(faces: Array, count: int) -> Array:
+    """`_joined` of faces that are being traced."""
+
+    def join(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        labels, _ = state
+        roots = labels[faces]
+        joined = labels.at[roots].min(jnp.min(roots, axis=1)[:, None])
+        return joined[joined], labels
+
+    labels = jnp.arange(count, dtype=jnp.int32) + 0 * faces[0, 0]
+    labels, _ = lax.while_loop(lambda s: jnp.any(s[0] != s[1]), join, (labels, labels - 1))
+    return labels[faces[:, 0]]
 
 
 def _turns(

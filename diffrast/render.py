@@ -413,12 +413,18 @@ def _scene_topology(scene: Scene, geometry: _Geometry) -> Topology:
         part.edges._replace(faces=moved(part.edges.faces, int(first)))
         for part, first in zip(own, first_faces, strict=False)
     ]
+    bodies = [jnp.zeros_like(t.patches) if t.bodies is None else t.bodies for t in own]
+
+    def numbered(parts: list[Array]) -> Array:
+        return jnp.concatenate([p + int(v) for p, v in zip(parts, first_vertices, strict=False)])
+
     return Topology(
         Edges(*(jnp.concatenate(column) for column in zip(*edges, strict=True))),
         jnp.concatenate(
             [moved(t.neighbors, int(f)) for t, f in zip(own, first_faces, strict=False)]
         ),
-        jnp.concatenate([t.patches + int(v) for t, v in zip(own, first_vertices, strict=False)]),
+        numbered([t.patches for t in own]),
+        None if len(own) == 1 and own[0].bodies is None else numbered(bodies),
     )
 
 

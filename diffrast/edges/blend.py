@@ -32,6 +32,7 @@ from diffrast.edges.pieces import (
     facing,
     to_pixels,
 )
+from diffrast.edges.piercing import PIXELS_AT_ONCE, Line, choose_pixels, cross, line_of
 from diffrast.edges.visibility import BACKGROUND, Seen, look
 
 _ROWS_AT_ONCE = 1024
@@ -73,10 +74,10 @@ class Records(NamedTuple):
     """Visible pieces, as many as there are rows; the first `total` are in use, or all."""
 
     total: Int[Array, ""]  # number of visible pieces
-    integers: Int[Array, "capacity 6"]  # pixel, pixels of front, beyond, rim; start and end vertex
+    integers: Int[Array, "capacity 6"]  # pixel, pixels of front, beyond, rim; two vertices
     jump: Float[Array, "capacity channels"]  # of the colour outwards, as the piece moves
     weights: Float[Array, "capacity 2"]  # area beyond as the pixel's centre sees it; rim's length
-    motion: Float[Array, "capacity 6"]  # of the area with x, y, w of start and end vertex
+    motion: Float[Array, "capacity 6"]  # of the area with x, y, w of the two vertices
 
 
 class Blended(NamedTuple):
@@ -125,8 +126,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
 
     `first` is the number of the visible piece from which on they are recorded.
     """
-    image, scene, shader = view.image, view.scene, method.shader
-    height, width, channels = image.shape[0] - 2, image.shape[1] - 2, image.shape[2]
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     edges = view.topology.edges
     pixels = to_pixels(view.positions_clip, height, width)
     volume = facing(pixels, view.faces)
@@ -134,73 +134,6 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     if method.cull_backfaces:
         seen = seen & ((volume < 0) if view.turned is None else (volume < 0) != view.turned)
     order, edge_count = choose_edges(edges, volume, seen, view.apart)
-    flat = image.reshape(-1, channels)
-
-    def add_pieces(n: Array, total: Blended, segments: Segments, ends: Array) -> Blended:
-        pieces = cut(segments, ends, n * PIECES_AT_ONCE, height=height, width=width)
-        found = look(pieces, segments, view.faces, pixels, view.topology, seen, view.face_image)
-        (column, row), rim = pieces.pixel, found.rim
-
-        def place(look: Array | int) -> Array:
-            return (row + look // 3) * (width + 2) + column + look % 3
-
-        def shade(*points: tuple[Array, list[Array]]) -> list[Array]:
-            assert shader is not None
-            face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
-            return jnp.split(jnp.stack(shader(scene, face, barycentrics), axis=-1), len(points))
-
-        places = [place(i) for i in (found.front.look, found.beyond.look, rim.inner)]
-        near, behind, inner = stored([flat[i] for i in places])
-        plain = view.background.ndim == 1
-        bare = view.background if plain else view.background.reshape(-1, channels)[place(4)]
-        behind = jnp.where((found.beyond.face == BACKGROUND)[:, None], bare, behind)
-        front = near
-        outward = jnp.where(found.front_on_right, -1, 1)
-        area = outward * _area(found.begin, found.end)
-        length = jnp.hypot(found.end[0] - found.begin[0], found.end[1] - found.begin[1])
-        smooth = jnp.zeros_like(found.visible)
-        if shader is None:
-            jump = behind - front
-            value = area[:, None] * jump
-        else:
-            front, beyond, bend, far = shade(found.front[:2], found.beyond[:2], rim.bend, rim.far)
-            behind = jnp.where(found.beyond.face[:, None] >= 0, beyond, behind)
-            smooth = rim.smooth
-            integral, moved = _along(found, front, bend, far, near, inner)
-            jump = behind - jnp.where(smooth[:, None], moved, front)
-            mean = integral - rim.depth[:, None] * near
-            value = jnp.where(
-                smooth[:, None],
-                area[:, None] * (behind - near) + length[:, None] * mean,
-                area[:, None] * jump,
-            )
-        jump, value, front, behind = stored((jump, value, front, behind))
-        size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
-        used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
-        pixel = stored(jnp.where(used, row * width + column, 0))
-        added = total.added.at[pixel].add(jnp.where(used[:, None], value, 0))
-        held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
-        low, high = total.range
-        low = low.at[pixel].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
-        high = high.at[pixel].max(jnp.where(used[:, None], jnp.max(held, axis=0), -jnp.inf))
-        rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
-        rims = total.rims.at[places[0]].add(rim_length)
-
-        records = total.records
-        slot = records.total + jnp.cumsum(used) - 1 - first
-        slot = jnp.where(used & (slot >= 0), slot, method.capacity)
-        start, end = segments.vertices[:, pieces.segment]
-        rows = (
-            jnp.stack([pixel, *places, start, end], axis=-1),
-            jump,
-            jnp.stack([area, rim_length], axis=-1),
-            stored(outward * _motion(segments, pieces, found)).T,
-        )
-        columns = (
-            old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
-        )
-        records = Records(records.total + jnp.sum(used), *columns)
-        return Blended(records, added, (low, high), rims)
 
     def add_edges(n: Array, total: Blended) -> Blended:
         slots = n * EDGES_AT_ONCE + jnp.arange(EDGES_AT_ONCE)
@@ -216,12 +149,45 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             width=width,
         )
         ends = jnp.cumsum(segments.parts)
-        chunks = (ends[-1] + PIECES_AT_ONCE - 1) // PIECES_AT_ONCE
-        return lax.fori_loop(
-            0, chunks, lambda i, total: add_pieces(i, total, segments, ends), total
-        )
 
-    zero, dtype, rows = edge_count & 0, image.dtype, method.capacity
+        def add_pieces(n: Array, total: Blended) -> Blended:
+            pieces = cut(segments, ends, n * PIECES_AT_ONCE, height=height, width=width)
+            found = look(pieces, segments, view.faces, pixels, view.topology, seen, view.face_image)
+            return _with_pieces(total, view, method, segments, pieces, found, first)
+
+        chunks = (ends[-1] + PIECES_AT_ONCE - 1) // PIECES_AT_ONCE
+        return lax.fori_loop(0, chunks, add_pieces, total)
+
+    chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
+    nothing = _nothing(view, method, edge_count & 0)
+    blended = lax.fori_loop(0, chunks, add_edges, nothing)
+    bodies = view.topology.bodies
+    if bodies is None:
+        return blended
+
+    order, pixel_count = choose_pixels(view.face_image, bodies)
+
+    def add_pixels(n: Array, total: Blended) -> Blended:
+        slots = n * PIXELS_AT_ONCE + jnp.arange(PIXELS_AT_ONCE)
+        number = order[jnp.minimum(slots, order.shape[0] - 1)]
+        pixel = jnp.stack([number % width, number // width])
+        exists = slots < pixel_count
+        crossings = cross(pixel, exists, view.faces, pixels, view.topology, seen, view.face_image)
+
+        def add_lines(n: Array, total: Blended) -> Blended:
+            return _with_lines(total, view, method, pixel, line_of(crossings, n, pixel), first)
+
+        most = jnp.max(jnp.sum(crossings.exists, axis=0))
+        return lax.fori_loop(0, most, add_lines, total)
+
+    chunks = (pixel_count + PIXELS_AT_ONCE - 1) // PIXELS_AT_ONCE
+    return lax.fori_loop(0, chunks, add_pixels, blended)
+
+
+def _nothing(view: View, method: Method, zero: Array) -> Blended:
+    """No pieces yet; `zero` is a number that varies with the view as what is added does."""
+    (height, width, channels), dtype = view.image.shape, view.image.dtype
+    rows, own = method.capacity, _cropped(view.image, view.image.shape)
     records = Records(
         zero,
         jnp.zeros((rows, 6), jnp.int32) + zero,
@@ -229,15 +195,133 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         jnp.zeros((rows, 2), dtype) + zero,
         jnp.zeros((rows, 6), dtype) + zero,
     )
-    own = _cropped(flat, image.shape)
-    nothing = Blended(
-        records,
-        jnp.zeros((height * width, channels), dtype) + zero,
-        (own, own),
-        jnp.zeros((height + 2) * (width + 2), dtype) + zero,
+    return Blended(
+        records, jnp.zeros_like(own) + zero, (own, own), jnp.zeros(height * width, dtype) + zero
     )
-    chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
-    return lax.fori_loop(0, chunks, add_edges, nothing)
+
+
+def _place(view: View, pixel: Array, look: Array | int) -> Array:
+    """Index in the image with its border of one of the 3×3 pixels round pixels."""
+    return (pixel[1] + look // 3) * view.image.shape[1] + pixel[0] + look % 3
+
+
+def _shade(
+    view: View, method: Method, *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]]
+) -> list[Array]:
+    """Colours of points on faces, several of each piece at once."""
+    assert method.shader is not None
+    face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
+    colors = jnp.stack(method.shader(view.scene, face, barycentrics), axis=-1)
+    return jnp.split(colors, len(points))
+
+
+def _with_pieces(
+    total: Blended,
+    view: View,
+    method: Method,
+    segments: Segments,
+    pieces: Pieces,
+    found: Seen,
+    first: ArrayLike,
+) -> Blended:
+    """Add pieces of edges."""
+    rim = found.rim
+    flat = view.image.reshape(-1, view.image.shape[2])
+    looks = (found.front.look, found.beyond.look, rim.inner)
+    places = [_place(view, pieces.pixel, look) for look in looks]
+    near, behind, inner = stored([flat[i] for i in places])
+    bare = view.background
+    if bare.ndim > 1:
+        bare = bare.reshape(flat.shape)[_place(view, pieces.pixel, 4)]
+    behind = jnp.where((found.beyond.face == BACKGROUND)[:, None], bare, behind)
+    front = near
+    outward = jnp.where(found.front_on_right, -1, 1)
+    area = outward * _area(found.begin, found.end)
+    length = jnp.hypot(found.end[0] - found.begin[0], found.end[1] - found.begin[1])
+    smooth = jnp.zeros_like(found.visible)
+    if method.shader is None:
+        jump = behind - front
+        value = area[:, None] * jump
+    else:
+        points = found.front[:2], found.beyond[:2], rim.bend, rim.far
+        front, beyond, bend, far = _shade(view, method, *points)
+        behind = jnp.where(found.beyond.face[:, None] >= 0, beyond, behind)
+        smooth = rim.smooth
+        integral, moved = _along(found, front, bend, far, near, inner)
+        jump = behind - jnp.where(smooth[:, None], moved, front)
+        mean = integral - rim.depth[:, None] * near
+        value = jnp.where(
+            smooth[:, None],
+            area[:, None] * (behind - near) + length[:, None] * mean,
+            area[:, None] * jump,
+        )
+    jump, value, front, behind = stored((jump, value, front, behind))
+    size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
+    used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
+    held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
+    rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
+    total = total._replace(rims=total.rims.at[places[0]].add(rim_length))
+    total, pixel = _with_values(total, view, pieces.pixel, used, value, held)
+    start, end = segments.vertices[:, pieces.segment]
+    rows = (
+        jnp.stack([pixel, *places, start, end], axis=-1),
+        jump,
+        jnp.stack([area, rim_length], axis=-1),
+        stored(outward * _motion(segments, pieces, found)).T,
+    )
+    return total._replace(records=_with_rows(total.records, used, rows, first))
+
+
+def _with_lines(
+    total: Blended, view: View, method: Method, pixel: Array, line: Line, first: ArrayLike
+) -> Blended:
+    """Add lines where surfaces pierce each other, as three rows each: two corners in every row."""
+    area = _area(line.begin, line.end)
+    places = [_place(view, pixel, look) for look in line.look]
+    if method.shader is None:
+        right, left = (view.image.reshape(-1, view.image.shape[2])[i] for i in places)
+    else:
+        points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
+        right, left = _shade(view, method, *points)
+    jump = stored(right - left)
+    value = area[:, None] * jump
+    total, own = _with_values(total, view, pixel, line.used, value, jnp.stack([right, left]))
+    corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
+    rows = [
+        (
+            jnp.stack([own, places[1], places[0], places[0], *corners[i]], axis=-1),
+            jump,
+            jnp.stack([area * (i == 0), jnp.zeros_like(area)], axis=-1),
+            stored(line.motion.reshape(3, 6, -1)[i].T),
+        )
+        for i in range(3)
+    ]
+    joined = tuple(jnp.concatenate(column) for column in zip(*rows, strict=True))
+    used = jnp.tile(line.used, 3)
+    return total._replace(records=_with_rows(total.records, used, joined, first))
+
+
+def _with_values(
+    total: Blended, view: View, pixel: Array, used: Array, value: Array, held: Array
+) -> tuple[Blended, Array]:
+    """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
+    number = stored(jnp.where(used, pixel[1] * (view.image.shape[1] - 2) + pixel[0], 0))
+    added = total.added.at[number].add(jnp.where(used[:, None], value, 0))
+    low, high = total.range
+    low = low.at[number].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
+    high = high.at[number].max(jnp.where(used[:, None], jnp.max(held, axis=0), -jnp.inf))
+    return total._replace(added=added, range=(low, high)), number
+
+
+def _with_rows(records: Records, used: Array, rows: tuple[Array, ...], first: ArrayLike) -> Records:
+    """Write rows behind those in use, as far as there is room."""
+    capacity = records.jump.shape[0]
+    slot = records.total + jnp.cumsum(used) - 1 - first
+    slot = jnp.where(used & (slot >= 0), slot, capacity)
+    columns = (
+        old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
+    )
+    return Records(records.total + jnp.sum(used), *columns)
 
 
 def _along(

@@ -1,0 +1,244 @@
+"""Lines along which surfaces pierce each other.
+
+The 1/w of a plane is linear on the screen, and so is the difference of that of two faces: where it
+is zero they meet, along a straight line, with the one in front on this side and the other on that.
+The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
+faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, and those next
+to one of each of two bodies. A surface that pierces itself is not found.
+
+With homogeneous corners V, a point p of the screen (x, y, 1) is the sum of λ V, the λ linear in p
+and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, and c · V = 1 at each
+corner; so where a corner moves by dV, 1/w changes at a fixed point by −λ c · dV.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+from diffrast._topology import Topology
+from diffrast.edges.neighborhood import only, picked, pixels_round
+from diffrast.edges.pieces import positive_part
+from diffrast.edges.planes import Table, corners_of
+from diffrast.raster.fixed_point import CULLED, group_by_class
+
+PIXELS_AT_ONCE = 256
+_REACH = 0.75  # pixels from the centre: farther than the corners
+_THROUGH = 0.01  # pixels to both sides of the line that both faces reach
+_TOLERANCE = 1e-3  # of 1/w: what is nearer by less does not hide
+
+_FACES = 9 + 2 * 3
+_ONE, _OTHER = np.array(list(itertools.combinations(range(_FACES), 2))).T
+
+
+class _Planes(NamedTuple):
+    """Faces that may be seen at each pixel, shape (15, n); from the pixel's centre."""
+
+    face: Array
+    look: Array  # 0 to 8: pixel of the 3×3 whose colour changes as this face's
+    corners: list[Array]  # λ of each corner at the centre, in units of the largest sum,
+    across: list[Array]  # and how they change along x
+    down: list[Array]  # and y
+    known: Array  # neither edge-on nor there already
+
+
+class Crossings(NamedTuple):
+    """Lines that may part pixels: one for each pair of faces, shape (pairs, n)."""
+
+    planes: _Planes
+    unit: Float[Array, " n"]  # of 1/w
+    exists: Bool[Array, "pairs n"]
+    range: tuple[Array, Array]  # begin and end along the line, from its point next to the centre
+
+
+class Line(NamedTuple):
+    """One line in each of n pixels."""
+
+    used: Bool[Array, " n"]
+    look: Int[Array, "2 n"]  # 0 to 8: pixels that show the face in front on the right and left
+    face: Int[Array, "2 n"]  # these faces,
+    barycentrics: list[Float[Array, "2 n"]]  # and where the line's middle lies on them
+    begin: Float[Array, "2 n"]  # ends, from the pixel's centre
+    end: Float[Array, "2 n"]
+    motion: Float[Array, "2 3 3 n"]  # area on the right with faces' corners' x, y, w
+
+
+def choose_pixels(
+    face_image: Int[Array, "height_with_border width_with_border"], bodies: Int[Array, " F"]
+) -> tuple[Int[Array, " pixels"], Int[Array, ""]]:
+    """Indices of the pixels round which two bodies are seen, in ascending order, and how many."""
+    body = jnp.where(face_image >= 0, bodies[jnp.maximum(face_image, 0)], -1)
+    largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
+    largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
+    largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
+    least = jnp.minimum(jnp.minimum(least[:-2], least[1:-1]), least[2:])
+    least = jnp.minimum(jnp.minimum(least[:, :-2], least[:, 1:-1]), least[:, 2:])
+    order, starts = group_by_class(jnp.where(largest > least, 0, CULLED).reshape(-1))
+    return order, starts[1]
+
+
+def cross(
+    pixel: Int[Array, "2 n"],
+    exists: Bool[Array, " n"],
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+    topology: Topology,
+    drawn: Bool[Array, " F"],
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> Crossings:
+    """Find where faces near pixels (column, row) pierce each other, seen or not."""
+    assert topology.bodies is not None
+    face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, drawn, face_image)
+    planes, unit = _planes(pixel, face, look, faces, pixels)
+    point, along, normal = _line(planes)
+    both = [
+        ([p[_ONE], p[_OTHER]], [x[_ONE], x[_OTHER]], [y[_ONE], y[_OTHER]])
+        for p, x, y in zip(planes.corners, planes.across, planes.down, strict=True)
+    ]
+
+    def inside(x: Array, y: Array) -> list[Array]:
+        square = [0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y]
+        return square + [p + x * a + y * b for c in both for p, a, b in zip(*c, strict=True)]
+
+    ends = [inside(*(p + r * d for p, d in zip(point, along, strict=True))) for r in (-1, 1)]
+    low, high = positive_part(*ends)
+    begin, end = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
+    middle = (begin + end) / (2 * _REACH)
+    x, y = stored([p + middle * d for p, d in zip(point, along, strict=True)])
+
+    # Both reach to both sides.
+    through = jnp.ones_like(exists)
+    for corners, across, down in both:
+        for p, a, b in zip(corners, across, down, strict=True):
+            least = p + x * a + y * b - _THROUGH * abs(a * normal[0] + b * normal[1])
+            through = through & (least > 0)
+    differ = (body[_ONE] != body[_OTHER]) & planes.known[_ONE] & planes.known[_OTHER]
+    return Crossings(planes, unit, exists & differ & (low < high) & through, (begin, end))
+
+
+def _candidates(
+    pixel: Array, bodies: Array, neighbors: Array, drawn: Array, face_image: Array
+) -> tuple[Array, Array, Array]:
+    """Faces, the pixels of the 3×3 where they or faces next to them are seen, and their bodies."""
+    pictured = stored(pixels_round(face_image, *pixel))
+    nearest_first = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
+    face = pictured[nearest_first]
+    body = jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1)
+    one = jnp.argmax(face >= 0, axis=0)
+    other = jnp.argmax((face >= 0) & (body != picked(body, one)), axis=0)
+    seen = jnp.stack([one, other])
+    look = jnp.concatenate(
+        [
+            jnp.broadcast_to(nearest_first[:, None], face.shape),
+            jnp.repeat(jnp.asarray(nearest_first)[seen], 3, axis=0),
+        ]
+    )
+    parents = jnp.stack([picked(face, one), picked(face, other)])
+    nearby = neighbors[jnp.maximum(parents, 0)].transpose(0, 2, 1).reshape(6, -1)
+    face = stored(jnp.concatenate([face, only(nearby, drawn)]))
+    return face, look, bodies[jnp.maximum(face, 0)]
+
+
+def _planes(
+    pixel: Array, face: Array, look: Array, faces: Array, pixels: Table
+) -> tuple[_Planes, Array]:
+    x, y, w = corners_of(face, faces, pixels)
+    centre = pixel + 0.5
+    u, v = stored((x - centre[0] * w, y - centre[1] * w))
+    turns = [(1, 2), (2, 0), (0, 1)]
+    values = [u[i] * v[j] - u[j] * v[i] for i, j in turns]
+    volume = values[0] * w[0] + values[1] * w[1] + values[2] * w[2]
+    inverse = stored(1 / jnp.where(volume == 0, 1, volume))
+    again = jnp.any(
+        face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
+    )
+    known = (face >= 0) & (volume != 0) & ~again
+    total = (values[0] + values[1] + values[2]) * inverse
+    largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
+    unit = stored(1 / jnp.where(largest > 0, largest, 1))
+    scale = inverse * unit
+    planes = _Planes(
+        face=face,
+        look=look,
+        corners=[value * scale for value in values],
+        across=[(w[j] * v[i] - w[i] * v[j]) * scale for i, j in turns],
+        down=[(u[j] * w[i] - u[i] * w[j]) * scale for i, j in turns],
+        known=known,
+    )
+    return stored(planes), unit
+
+
+def _line(planes: _Planes) -> tuple[list[Array], list[Array], list[Array]]:
+    """The point of each pair's line next to the centre, a step along it and its unit normal.
+
+    The normal points to where the first face is in front: to the right along the step.
+    """
+    value, across, down = (
+        (c[0] + c[1] + c[2])[_ONE] - (c[0] + c[1] + c[2])[_OTHER]
+        for c in (planes.corners, planes.across, planes.down)
+    )
+    steepness = jnp.hypot(across, down)
+    inverse = 1 / jnp.where(steepness > 0, steepness, 1)
+    normal = stored([across * inverse, down * inverse])
+    away = jnp.where(steepness > 0, -value * inverse, 2)
+    point = stored([away * n for n in normal])
+    return point, [-_REACH * normal[1], _REACH * normal[0]], normal
+
+
+def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Line:
+    """The line with this number, 0 and up, in each pixel, if it is visible."""
+    rank = jnp.cumsum(crossings.exists, axis=0) - 1
+    here = crossings.exists & (rank == number)
+    pair = stored(jnp.argmax(here, axis=0))
+    which = stored(jnp.stack([jnp.asarray(_ONE)[pair], jnp.asarray(_OTHER)[pair]]))
+
+    def both(values: Array) -> Array:
+        return stored(jnp.stack([picked(values, which[0]), picked(values, which[1])]))
+
+    planes = crossings.planes
+    at = [[both(c) for c in column] for column in (planes.corners, planes.across, planes.down)]
+    sums = [c[0] + c[1] + c[2] for c in at]  # 1/w and its slopes, of both faces
+    value, across, down = (c[0] - c[1] for c in sums)
+    steepness = jnp.hypot(across, down)
+    inverse = 1 / jnp.where(steepness > 0, steepness, 1)
+    normal = jnp.stack([across * inverse, down * inverse])
+    along = jnp.stack([-normal[1], normal[0]])
+    first, last = (picked(part, pair) for part in crossings.range)
+    point = -value * inverse * normal
+    begin, end = point + first * along, point + last * along
+    x, y = (begin + end) / 2
+    inside = [p + x * a + y * b for p, a, b in zip(*at, strict=True)]
+    depth = inside[0] + inside[1] + inside[2]
+    used = jnp.any(here, axis=0) & ~_hidden(planes, x, y, depth[0])
+
+    centre = pixel + 0.5
+    plane = jnp.stack(
+        [sums[1], sums[2], depth - (x + centre[0]) * sums[1] - (y + centre[1]) * sums[2]]
+    )
+    # λ is in units of 1/w, and so are the planes and the slope that divides them.
+    factor = (last - first) * inverse / crossings.unit * jnp.array([[-1], [1]])
+    motion = jnp.stack(inside)[:, None] * (factor * plane)[None]
+    return Line(
+        used=used,
+        look=both(planes.look),
+        face=both(planes.face),
+        barycentrics=[value / jnp.where(depth > 0, depth, 1) for value in inside],
+        begin=begin,
+        end=end,
+        motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
+    )
+
+
+def _hidden(planes: _Planes, x: Array, y: Array, depth: Array) -> Array:
+    """Whether one of the faces is before the point (x, y), whose 1/w is `depth`."""
+    values = [
+        p + x * a + y * b
+        for p, a, b in zip(planes.corners, planes.across, planes.down, strict=True)
+    ]
+    covers = (values[0] >= 0) & (values[1] >= 0) & (values[2] >= 0) & planes.known
+    nearer = values[0] + values[1] + values[2] > depth * (1 + _TOLERANCE)
+    return jnp.any(covers & nearer, axis=0)
