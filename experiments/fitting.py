@@ -69,8 +69,12 @@ def coarse_to_fine(height: int, width: int) -> list[Level]:
     ]
     shrink = max(small_enough, default=1)
     unit = min(height, width) / shrink / 128
-    levels = [Level(shrink, 1, 8 * unit, 20, False), Level(shrink, 1, 2 * unit, 20, True)]
-    return [*levels, Level(1, 4, 0.0 if shrink > 1 else 0.5, 10, True)]
+    samples = 4 if shrink > 1 else 16  # a small picture holds much that is smaller than a pixel
+    return [
+        Level(shrink, samples, 8 * unit, 20, False),
+        Level(shrink, samples, 2 * unit, 20, True),
+        Level(1, samples, 0.0 if shrink > 1 else 0.5, 10, True),
+    ]
 
 
 # Residuals ----------------------------------------------------------------------------------------

@@ -74,6 +74,7 @@ BOUNDS = {
     "sphere": (0.02, 0.02),
     "torus2": (0.04, 0.02),
     "lattice": (0.12, 0.05),
+    "piercing": (0.025, 0.025),
 }
 # How many times smaller the error of the image is than that of so many samples.
 BETTER = {"cubes": (10, 1), "sphere": (1, 16), "lattice": (1, 16)}

@@ -13,11 +13,12 @@ TANGENT = jnp.array([1.0, 2.0, 3.0])
 
 @pytest.fixture(scope="module")
 def image():
-    return renderer(dr.RenderSettings(height=24, width=32))
+    return renderer(antialias=False)
 
 
-def renderer(settings):
+def renderer(antialias):
     mesh = dr.shapes.icosphere(1)
+    settings = dr.RenderSettings(height=24, width=32, antialias=antialias)
     scene = dr.Scene(
         objects=[dr.Object(mesh)],
         lights=[dr.PointLight(position=(2, 2, 3))],
@@ -75,16 +76,6 @@ def test_grad_of_scan_with_checkpoints(loss, gradients):
 
 
 def test_hessian_vector_product(loss):
-    product = jax.jit(lambda e, t: jax.jvp(jax.grad(loss), (e,), (t,))[1])(EYES[1], TANGENT)
-    assert np.all(np.isfinite(product))  # without the second derivative of what is visible
-
-
-def test_hessian_vector_product_of_the_shading():
-    image = renderer(dr.RenderSettings(height=24, width=32, antialias=False))
-
-    def loss(eye):
-        return jnp.mean(image(eye) ** 2)
-
     with jax.enable_x64(True):
         eye, tangent = jnp.asarray(EYES[1], jnp.float64), jnp.asarray(TANGENT, jnp.float64)
         gradient = jax.jit(jax.grad(loss))
@@ -102,3 +93,26 @@ def test_shard_map(loss, gradients):
     gradient = jax.vmap(jax.grad(loss))
     sharded = jax.jit(jax.shard_map(gradient, mesh=devices, in_specs=views, out_specs=views))
     np.testing.assert_allclose(sharded(EYES), gradients, rtol=1e-5, atol=1e-7)
+
+
+def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
+    image = renderer(antialias=True)
+
+    def loss(eye):
+        return jnp.mean(image(eye) ** 2)
+
+    def derivatives(eye):  # the second one without that of what is visible
+        return jax.jvp(jax.grad(loss), (eye,), (TANGENT,))
+
+    devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
+    views = jax.sharding.PartitionSpec("views")
+
+    def of_all(eyes):
+        return jax.lax.scan(lambda none, eye: (none, derivatives(eye)), None, eyes)[1]
+
+    sharded = jax.shard_map(of_all, mesh=devices, in_specs=views, out_specs=views)
+    gradients, products = jax.jit(sharded)(EYES[:2])
+    mapped = jax.jit(jax.vmap(jax.grad(loss)))(EYES[:2])
+    np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
+    assert np.all(np.isfinite(products))
+    assert np.all(np.any(products != 0, axis=1))

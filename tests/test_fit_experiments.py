@@ -1,0 +1,48 @@
+"""The experiments that fit shape and pose, at tiny size: what they find and what they write."""
+
+import json
+
+import fit_pose
+import fit_shape
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrast as dr
+
+
+def test_a_sphere_becomes_the_body(tmp_path):
+    report = fit_shape.run(tmp_path, size=32, views=5, subdivisions=2, steps=60, smoothness=3.0)
+    fitted = report["fits"]["visibility"]
+    assert fitted["found"]["loss"] < 0.1 * fitted["at_start"]["loss"]
+    assert fitted["found"]["mean_percent"] < 0.5 * fitted["at_start"]["mean_percent"]
+    assert json.loads((tmp_path / "fit_shape.json").read_text())["vertices"] == 162
+    assert (tmp_path / "fit_shape.png").is_file()
+
+
+def test_the_pose_of_a_lattice_is_found(tmp_path):
+    report = fit_pose.run(tmp_path, starts=1, size=48, cells=2, degrees=4.0, percent=2.0, steps=8)
+    row = report["starts"][0]
+    for name in fit_pose.CRITERION:
+        assert row["visibility"][name] < 0.2 * row["at_start"][name]
+    assert json.loads((tmp_path / "fit_pose.json").read_text())["seed"] == 0
+    assert (tmp_path / "fit_pose.png").is_file()
+
+
+def test_distances_are_those_along_the_normal():
+    unit = dr.shapes.icosphere(2).vertices
+    surface = unit * fit_shape.body_radius(unit)[:, None]
+    np.testing.assert_allclose(fit_shape.distances(surface), 0, atol=1e-6)
+    fine = fit_shape.body(6).vertices
+    for point in 1.04 * surface[:5]:
+        nearest = jnp.min(dr.linalg.norm(fine - point))
+        assert fit_shape.distances(point[None])[0] == pytest.approx(float(nearest), rel=0.2)
+
+
+def test_the_lattice_is_a_closed_body_of_edge_length_one():
+    mesh = fit_pose.lattice(3)
+    assert dr.mesh.is_closed(mesh)
+    assert 0 < dr.mesh.signed_volume(mesh) < 0.5
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), 1, rtol=1e-6)
+    full = dr.mesh.signed_volume(fit_pose.lattice(2, missing=0.0, bar=0.25))
+    assert full == pytest.approx((27 * 0.25**3 + 54 * 0.75 * 0.25**2) / 2.25**3, rel=1e-5)
