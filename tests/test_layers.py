@@ -45,6 +45,7 @@ ORDER = [
     "diffrast.edges.neighborhood",
     "diffrast.edges.rim",
     "diffrast.edges.visibility",
+    "diffrast.edges.piercing",
     "diffrast.edges.blend",
     "diffrast.edges.antialias",
     "diffrast.edges",

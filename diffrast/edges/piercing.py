@@ -22,11 +22,10 @@ from jaxtyping import Bool, Float, Int
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import only, picked, pixels_round
-from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import Table, corners_of
 from diffrast.raster.fixed_point import CULLED, group_by_class
 
-PIXELS_AT_ONCE = 256
+PIXELS_AT_ONCE = 64
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _TOLERANCE = 1e-3  # of 1/w: what is nearer by less does not hide
@@ -40,9 +39,7 @@ class _Planes(NamedTuple):
 
     face: Array
     look: Array  # 0 to 8: pixel of the 3×3 whose colour changes as this face's
-    corners: list[Array]  # λ of each corner at the centre, in units of the largest sum,
-    across: list[Array]  # and how they change along x
-    down: list[Array]  # and y
+    lambdas: Array  # (3, 3 corners, 15, n): at the centre in units of the largest sum, slopes
     known: Array  # neither edge-on nor there already
 
 
@@ -95,27 +92,24 @@ def cross(
     face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, drawn, face_image)
     planes, unit = _planes(pixel, face, look, faces, pixels)
     point, along, normal = _line(planes)
-    both = [
-        ([p[_ONE], p[_OTHER]], [x[_ONE], x[_OTHER]], [y[_ONE], y[_OTHER]])
-        for p, x, y in zip(planes.corners, planes.across, planes.down, strict=True)
-    ]
+    both = planes.lambdas[:, :, np.stack([_ONE, _OTHER])]  # (3, 3 corners, 2 faces, pairs, n)
 
-    def inside(x: Array, y: Array) -> list[Array]:
-        square = [0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y]
-        return square + [p + x * a + y * b for c in both for p, a, b in zip(*c, strict=True)]
+    def inside(x: Array, y: Array) -> Array:
+        square = jnp.stack([0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y])
+        on_faces = both[0] + x * both[1] + y * both[2]
+        return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
 
-    ends = [inside(*(p + r * d for p, d in zip(point, along, strict=True))) for r in (-1, 1)]
-    low, high = positive_part(*ends)
+    ends = [inside(*(point + r * along)) for r in (-1, 1)]
+    crossing = ends[0] / jnp.where((ends[0] < 0) == (ends[1] < 0), 1, ends[0] - ends[1])
+    low = jnp.max(jnp.where(ends[0] < 0, jnp.where(ends[1] < 0, 2, crossing), 0), axis=0)
+    high = jnp.min(jnp.where((ends[0] >= 0) & (ends[1] < 0), crossing, 1), axis=0)
     begin, end = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
-    middle = (begin + end) / (2 * _REACH)
-    x, y = stored([p + middle * d for p, d in zip(point, along, strict=True)])
 
     # Both reach to both sides.
-    through = jnp.ones_like(exists)
-    for corners, across, down in both:
-        for p, a, b in zip(corners, across, down, strict=True):
-            least = p + x * a + y * b - _THROUGH * abs(a * normal[0] + b * normal[1])
-            through = through & (least > 0)
+    x, y = stored(point + (begin + end) / (2 * _REACH) * along)
+    slope = abs(both[1] * normal[0] + both[2] * normal[1])
+    least = both[0] + x * both[1] + y * both[2] - _THROUGH * slope
+    through = jnp.min(least, axis=(0, 1)) > 0
     differ = (body[_ONE] != body[_OTHER]) & planes.known[_ONE] & planes.known[_OTHER]
     return Crossings(planes, unit, exists & differ & (low < high) & through, (begin, end))
 
@@ -161,32 +155,25 @@ def _planes(
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
     scale = inverse * unit
-    planes = _Planes(
-        face=face,
-        look=look,
-        corners=[value * scale for value in values],
-        across=[(w[j] * v[i] - w[i] * v[j]) * scale for i, j in turns],
-        down=[(u[j] * w[i] - u[i] * w[j]) * scale for i, j in turns],
-        known=known,
-    )
-    return stored(planes), unit
+    at_centre = jnp.stack(values) * scale
+    across = jnp.stack([w[j] * v[i] - w[i] * v[j] for i, j in turns]) * scale
+    down = jnp.stack([u[j] * w[i] - u[i] * w[j] for i, j in turns]) * scale
+    lambdas = stored(jnp.stack([at_centre, across, down]))
+    return _Planes(face=face, look=look, lambdas=lambdas, known=known), unit
 
 
-def _line(planes: _Planes) -> tuple[list[Array], list[Array], list[Array]]:
+def _line(planes: _Planes) -> tuple[Array, Array, Array]:
     """The point of each pair's line next to the centre, a step along it and its unit normal.
 
     The normal points to where the first face is in front: to the right along the step.
     """
-    value, across, down = (
-        (c[0] + c[1] + c[2])[_ONE] - (c[0] + c[1] + c[2])[_OTHER]
-        for c in (planes.corners, planes.across, planes.down)
-    )
+    sums = stored(jnp.sum(planes.lambdas, axis=1))
+    value, across, down = sums[:, _ONE] - sums[:, _OTHER]
     steepness = jnp.hypot(across, down)
     inverse = 1 / jnp.where(steepness > 0, steepness, 1)
-    normal = stored([across * inverse, down * inverse])
-    away = jnp.where(steepness > 0, -value * inverse, 2)
-    point = stored([away * n for n in normal])
-    return point, [-_REACH * normal[1], _REACH * normal[0]], normal
+    normal = stored(jnp.stack([across * inverse, down * inverse]))
+    point = stored(jnp.where(steepness > 0, -value * inverse, 2) * normal)
+    return point, jnp.stack([-_REACH * normal[1], _REACH * normal[0]]), normal
 
 
 def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Line:
@@ -200,8 +187,9 @@ def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Li
         return stored(jnp.stack([picked(values, which[0]), picked(values, which[1])]))
 
     planes = crossings.planes
-    at = [[both(c) for c in column] for column in (planes.corners, planes.across, planes.down)]
-    sums = [c[0] + c[1] + c[2] for c in at]  # 1/w and its slopes, of both faces
+    at = jnp.take_along_axis(planes.lambdas, which[None, None], axis=2, mode="promise_in_bounds")
+    at = stored(at)
+    sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
     value, across, down = (c[0] - c[1] for c in sums)
     steepness = jnp.hypot(across, down)
     inverse = 1 / jnp.where(steepness > 0, steepness, 1)
@@ -211,8 +199,8 @@ def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Li
     point = -value * inverse * normal
     begin, end = point + first * along, point + last * along
     x, y = (begin + end) / 2
-    inside = [p + x * a + y * b for p, a, b in zip(*at, strict=True)]
-    depth = inside[0] + inside[1] + inside[2]
+    inside = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)
+    depth = jnp.sum(inside, axis=0)
     used = jnp.any(here, axis=0) & ~_hidden(planes, x, y, depth[0])
 
     centre = pixel + 0.5
@@ -221,7 +209,7 @@ def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Li
     )
     # λ is in units of 1/w, and so are the planes and the slope that divides them.
     factor = (last - first) * inverse / crossings.unit * jnp.array([[-1], [1]])
-    motion = jnp.stack(inside)[:, None] * (factor * plane)[None]
+    motion = inside[:, None] * (factor * plane)[None]
     return Line(
         used=used,
         look=both(planes.look),
@@ -235,10 +223,6 @@ def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Li
 
 def _hidden(planes: _Planes, x: Array, y: Array, depth: Array) -> Array:
     """Whether one of the faces is before the point (x, y), whose 1/w is `depth`."""
-    values = [
-        p + x * a + y * b
-        for p, a, b in zip(planes.corners, planes.across, planes.down, strict=True)
-    ]
-    covers = (values[0] >= 0) & (values[1] >= 0) & (values[2] >= 0) & planes.known
-    nearer = values[0] + values[1] + values[2] > depth * (1 + _TOLERANCE)
-    return jnp.any(covers & nearer, axis=0)
+    values = planes.lambdas[0] + x * planes.lambdas[1] + y * planes.lambdas[2]
+    covers = jnp.all(values >= 0, axis=0) & planes.known
+    return jnp.any(covers & (jnp.sum(values, axis=0) > depth * (1 + _TOLERANCE)), axis=0)
