@@ -5,8 +5,8 @@
 Random starts, turned about the teapot by up to 25 degrees round any axis and up to 15 % nearer or
 farther, are fitted to one picture of it, rendered with four times the samples of the fit. Both
 methods see the same blurred differences, coarse to fine; lights and material are known. A fit
-counts as converged if the rotation ends within 0.2 degrees and the eye within 0.5 % of its distance,
-which is a tenth of a pixel of these small pictures.
+counts as converged if the rotation ends within 0.2 degrees and the eye within 0.5 % of its
+distance, which is a tenth of a pixel of these small pictures.
 
 Expected: all starts converge with Levenberg-Marquardt, in about 18 renders each, each with its
 derivative by the seven camera parameters. Adam takes all its steps, 122 renders, and leaves about a
