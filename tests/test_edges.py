@@ -84,6 +84,27 @@ def test_values_and_derivatives_are_finite(case):
             assert np.all(np.isfinite(leaf))
 
 
+def test_bodies_that_lie_in_one_another_have_no_line_in_common():
+    """A cube twice, in two colours: nothing changes where nothing does with one."""
+    cube = dr.shapes.cube()
+    twice = [dr.Object(cube, dr.Material(diffuse=c)) for c in ((1, 0, 0), (0, 0, 1))]
+    settings = dataclasses.replace(SETTINGS, shading="unlit")
+    shift = jnp.array([0.3, 0.2, 0.1])
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def moved(number):
+        def image(s):
+            matrix = jnp.eye(4).at[:3, 3].set(s * shift)
+            objects = [dataclasses.replace(o, transform=matrix) for o in twice[:number]]
+            return dr.render(dr.Scene(objects=objects), camera(), settings)
+
+        return jax.jvp(image, (0.0,), (1.0,))[1].sum(axis=-1)
+
+    one, two = moved(1), moved(2)
+    np.testing.assert_allclose(two[one == 0], 0, atol=1e-4)
+    assert np.sum(one == 0) > 200
+
+
 def test_no_piece_is_lost_however_few_records_there_are():
     size = 24
     clip = dr.world_to_clip(camera(), MESH.vertices)

@@ -29,6 +29,7 @@ PIXELS_AT_ONCE = 64
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _TOLERANCE = 1e-3  # of 1/w: what is nearer by less does not hide
+_ROUNDINGS = 64  # in the slope of 1/w
 
 _FACES = 9 + 2 * 3
 _ONE, _OTHER = np.array(list(itertools.combinations(range(_FACES), 2))).T
@@ -91,7 +92,7 @@ def cross(
     assert topology.bodies is not None
     face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, drawn, face_image)
     planes, unit = _planes(pixel, face, look, faces, pixels)
-    point, along, normal = _line(planes)
+    point, along, normal, steep = _line(planes)
     both = planes.lambdas[:, :, np.stack([_ONE, _OTHER])]  # (3, 3 corners, 2 faces, pairs, n)
 
     def inside(x: Array, y: Array) -> Array:
@@ -111,7 +112,8 @@ def cross(
     least = both[0] + x * both[1] + y * both[2] - _THROUGH * slope
     through = jnp.min(least, axis=(0, 1)) > 0
     differ = (body[_ONE] != body[_OTHER]) & planes.known[_ONE] & planes.known[_OTHER]
-    return Crossings(planes, unit, exists & differ & (low < high) & through, (begin, end))
+    exists = exists & differ & steep & (low < high) & through
+    return Crossings(planes, unit, exists, (begin, end))
 
 
 def _candidates(
@@ -150,7 +152,7 @@ def _planes(
     again = jnp.any(
         face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
     )
-    known = (face >= 0) & (volume != 0) & ~again
+    known = (face >= 0) & (volume != 0) & jnp.isfinite(volume) & ~again
     total = (values[0] + values[1] + values[2]) * inverse
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
@@ -162,10 +164,11 @@ def _planes(
     return _Planes(face=face, look=look, lambdas=lambdas, known=known), unit
 
 
-def _line(planes: _Planes) -> tuple[Array, Array, Array]:
+def _line(planes: _Planes) -> tuple[Array, Array, Array, Array]:
     """The point of each pair's line next to the centre, a step along it and its unit normal.
 
-    The normal points to where the first face is in front: to the right along the step.
+    The normal points to where the first face is in front: to the right along the step. Last comes
+    whether the planes differ by more than rounding: faces that lie on one another have no line.
     """
     sums = stored(jnp.sum(planes.lambdas, axis=1))
     value, across, down = sums[:, _ONE] - sums[:, _OTHER]
@@ -173,7 +176,9 @@ def _line(planes: _Planes) -> tuple[Array, Array, Array]:
     inverse = 1 / jnp.where(steepness > 0, steepness, 1)
     normal = stored(jnp.stack([across * inverse, down * inverse]))
     point = stored(jnp.where(steepness > 0, -value * inverse, 2) * normal)
-    return point, jnp.stack([-_REACH * normal[1], _REACH * normal[0]]), normal
+    rounding = _ROUNDINGS * jnp.finfo(value.dtype).eps * jnp.max(abs(planes.lambdas), axis=(0, 1))
+    steep = steepness > rounding[_ONE] + rounding[_OTHER]
+    return point, jnp.stack([-_REACH * normal[1], _REACH * normal[0]]), normal, steep
 
 
 def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Line:
