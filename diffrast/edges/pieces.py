@@ -38,10 +38,6 @@ class Segments(NamedTuple):
     range: Float[Array, "2 n"]  # of the clipped part on the edge, 0 to 1
     parts: Int[Array, " n"]  # as many pieces
 
-    def __getitem__(self, index: Array) -> "Segments":  # type: ignore[override]
-        """The segments of these numbers."""
-        return Segments(*(column[..., index] for column in self))
-
 
 class Pieces(NamedTuple):
     """Parts of edges within one pixel, along the last axis."""

@@ -22,13 +22,13 @@ from jaxtyping import Bool, Float, Int
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import only, picked, pixels_round
-from diffrast.edges.planes import Table, corners_of
+from diffrast.edges.pieces import positive_part
+from diffrast.edges.planes import TOLERANCE, Table, corners_of
 from diffrast.raster.fixed_point import CULLED, group_by_class
 
 PIXELS_AT_ONCE = 64
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
-_TOLERANCE = 1e-3  # of 1/w: what is nearer by less does not hide
 _ROUNDINGS = 64  # in the slope of 1/w
 
 _FACES = 9 + 2 * 3
@@ -92,7 +92,9 @@ def cross(
     assert topology.bodies is not None
     face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, drawn, face_image)
     planes, unit = _planes(pixel, face, look, faces, pixels)
-    point, along, normal, steep = _line(planes)
+    sums = stored(jnp.sum(planes.lambdas, axis=1))
+    point, normal, inverse = stored(_line(sums[:, _ONE] - sums[:, _OTHER]))
+    along = _REACH * _left_of(normal)
     both = planes.lambdas[:, :, np.stack([_ONE, _OTHER])]  # (3, 3 corners, 2 faces, pairs, n)
 
     def inside(x: Array, y: Array) -> Array:
@@ -101,9 +103,7 @@ def cross(
         return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
 
     ends = [inside(*(point + r * along)) for r in (-1, 1)]
-    crossing = ends[0] / jnp.where((ends[0] < 0) == (ends[1] < 0), 1, ends[0] - ends[1])
-    low = jnp.max(jnp.where(ends[0] < 0, jnp.where(ends[1] < 0, 2, crossing), 0), axis=0)
-    high = jnp.min(jnp.where((ends[0] >= 0) & (ends[1] < 0), crossing, 1), axis=0)
+    low, high = positive_part(*map(list, ends))
     begin, end = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
 
     # Both reach to both sides.
@@ -111,6 +111,10 @@ def cross(
     slope = abs(both[1] * normal[0] + both[2] * normal[1])
     least = both[0] + x * both[1] + y * both[2] - _THROUGH * slope
     through = jnp.min(least, axis=(0, 1)) > 0
+    # Faces that lie on one another differ by rounding, and have no line.
+    largest = jnp.max(abs(planes.lambdas), axis=(0, 1))
+    rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[_ONE] + largest[_OTHER])
+    steep = inverse * rounding < 1
     differ = (body[_ONE] != body[_OTHER]) & planes.known[_ONE] & planes.known[_OTHER]
     exists = exists & differ & steep & (low < high) & through
     return Crossings(planes, unit, exists, (begin, end))
@@ -164,21 +168,23 @@ def _planes(
     return _Planes(face=face, look=look, lambdas=lambdas, known=known), unit
 
 
-def _line(planes: _Planes) -> tuple[Array, Array, Array, Array]:
-    """The point of each pair's line next to the centre, a step along it and its unit normal.
+def _line(difference: Array) -> tuple[Array, Array, Array]:
+    """Where planes meet whose 1/w differ by this at the centre, and with x and y: shape (3, ...).
 
-    The normal points to where the first face is in front: to the right along the step. Last comes
-    whether the planes differ by more than rounding: faces that lie on one another have no line.
+    The line's point next to the centre, its unit normal towards where the first plane is in front,
+    and by how much it moves where the difference changes by one; infinite where there is no line.
     """
-    sums = stored(jnp.sum(planes.lambdas, axis=1))
-    value, across, down = sums[:, _ONE] - sums[:, _OTHER]
+    value, across, down = difference
     steepness = jnp.hypot(across, down)
-    inverse = 1 / jnp.where(steepness > 0, steepness, 1)
-    normal = stored(jnp.stack([across * inverse, down * inverse]))
-    point = stored(jnp.where(steepness > 0, -value * inverse, 2) * normal)
-    rounding = _ROUNDINGS * jnp.finfo(value.dtype).eps * jnp.max(abs(planes.lambdas), axis=(0, 1))
-    steep = steepness > rounding[_ONE] + rounding[_OTHER]
-    return point, jnp.stack([-_REACH * normal[1], _REACH * normal[0]]), normal, steep
+    exists = steepness > 0
+    inverse = 1 / jnp.where(exists, steepness, 1)
+    normal = jnp.stack([across * inverse, down * inverse])
+    return -value * inverse * normal, normal, jnp.where(exists, inverse, jnp.inf)
+
+
+def _left_of(normal: Array) -> Array:
+    """The direction which has a normal on its right."""
+    return jnp.stack([-normal[1], normal[0]])
 
 
 def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Line:
@@ -195,13 +201,9 @@ def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Li
     at = jnp.take_along_axis(planes.lambdas, which[None, None], axis=2, mode="promise_in_bounds")
     at = stored(at)
     sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
-    value, across, down = (c[0] - c[1] for c in sums)
-    steepness = jnp.hypot(across, down)
-    inverse = 1 / jnp.where(steepness > 0, steepness, 1)
-    normal = jnp.stack([across * inverse, down * inverse])
-    along = jnp.stack([-normal[1], normal[0]])
+    point, normal, inverse = _line(sums[:, 0] - sums[:, 1])
+    along = _left_of(normal)
     first, last = (picked(part, pair) for part in crossings.range)
-    point = -value * inverse * normal
     begin, end = point + first * along, point + last * along
     x, y = (begin + end) / 2
     inside = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)
@@ -230,4 +232,4 @@ def _hidden(planes: _Planes, x: Array, y: Array, depth: Array) -> Array:
     """Whether one of the faces is before the point (x, y), whose 1/w is `depth`."""
     values = planes.lambdas[0] + x * planes.lambdas[1] + y * planes.lambdas[2]
     covers = jnp.all(values >= 0, axis=0) & planes.known
-    return jnp.any(covers & (jnp.sum(values, axis=0) > depth * (1 + _TOLERANCE)), axis=0)
+    return jnp.any(covers & (jnp.sum(values, axis=0) > depth * (1 + TOLERANCE)), axis=0)

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 
+TOLERANCE = 1e-3  # of 1/w: surfaces nearer to one another than this touch
+
 Columns = list[Float[Array, "*n"]]
 Table = Float[Array, "4 V"]  # vertices in homogeneous pixel coordinates x, y, z, w
 

@@ -17,6 +17,7 @@ from diffrast._topology import Topology
 from diffrast.edges.neighborhood import only, picked, pixel_at, pixels_round, ring, ring_of_edge
 from diffrast.edges.pieces import Pieces, Segments, positive_part
 from diffrast.edges.planes import (
+    TOLERANCE,
     Columns,
     Table,
     area,
@@ -29,7 +30,6 @@ from diffrast.edges.planes import (
 )
 from diffrast.edges.rim import Rim, look_inwards
 
-_TOLERANCE = 1e-3  # of 1/w: surfaces nearer to one another than this touch
 _BEYOND = 5e-4  # pixels from the edge to the point that shows what is behind it
 _BEFORE = 1e-3  # pixels from the edge to the points that show what hides it, in its face
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
@@ -121,7 +121,7 @@ def look(
     inset = -jnp.minimum(_BEFORE, thickness / 2) * out
     x, y = (ends[0] + inset)[:, None] + pieces.range * along[:, None]
     values, depth = edge_values(candidates[:, :, None], x[:, None], y[:, None])
-    margin = depth - (inverse_depth(pieces.range) * (1 + _TOLERANCE))[:, None]
+    margin = depth - (inverse_depth(pieces.range) * (1 + TOLERANCE))[:, None]
     low, high = _unhidden(foreign, *zip(*[*values, margin], strict=True))
     span = pieces.range[1] - pieces.range[0]
     low, high = stored((pieces.range[0] + low * span, pieces.range[0] + high * span))
@@ -133,7 +133,7 @@ def look(
     # What is behind.
     x, y = centre + middle + _BEYOND * out
     values, depth = edge_values(candidates, x, y)
-    behind = foreign & covers(values) & (depth <= near * (1 + _TOLERANCE))
+    behind = foreign & covers(values) & (depth <= near * (1 + TOLERANCE))
     candidate = stored(jnp.where(behind, depth, 0))
     nearest = stored(jnp.max(candidate, axis=0))
     number = jnp.arange(candidate.shape[0])[:, None]
@@ -157,7 +157,7 @@ def look(
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
     size = stored(area(candidates[:, :, :9]))
-    above = (size < _TRUSTED) & foreign[:9] & (depth[:9] > near * (1 + _TOLERANCE))
+    above = (size < _TRUSTED) & foreign[:9] & (depth[:9] > near * (1 + TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # A face that is found may be shown by another pixel. Where none is known to be behind, though
