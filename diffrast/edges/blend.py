@@ -30,6 +30,8 @@ from diffrast.edges.pieces import (
     clip_edges,
     cut,
     facing,
+    gathered,
+    no_pieces,
     to_pixels,
 )
 from diffrast.edges.piercing import PIXELS_AT_ONCE, Line, choose_pixels, cross, line_of
@@ -133,6 +135,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     seen = volume != 0
     if method.cull_backfaces:
         seen = seen & ((volume < 0) if view.turned is None else (volume < 0) != view.turned)
+    drawn = stored(jnp.where(seen, volume, 0))
     order, edge_count = choose_edges(edges, volume, seen, view.apart)
 
     def add_edges(n: Array, total: Blended) -> Blended:
@@ -150,13 +153,23 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         )
         ends = jnp.cumsum(segments.parts)
 
-        def add_pieces(n: Array, total: Blended) -> Blended:
-            pieces = cut(segments, ends, n * PIECES_AT_ONCE, height=height, width=width)
-            found = look(pieces, segments, view.faces, pixels, view.topology, seen, view.face_image)
-            return _with_pieces(total, view, method, segments, pieces, found, first)
+        def add_pieces(state: tuple[Array, Pieces, Blended]) -> tuple[Array, Pieces, Blended]:
+            next_piece, left, total = state
+            waiting = jnp.sum(left.exists)
+            first_piece = next_piece - waiting
+            pieces = cut(segments, ends, first_piece, height=height, width=width)
+            pieces = jax.tree.map(lambda a, b: jnp.where(left.exists, a, b), left, pieces)
+            found, left = look(
+                pieces, segments, view.faces, pixels, view.topology, drawn, view.face_image
+            )
+            total = _with_pieces(total, view, method, segments, pieces, found, first)
+            return first_piece + PIECES_AT_ONCE, gathered(left), total
 
-        chunks = (ends[-1] + PIECES_AT_ONCE - 1) // PIECES_AT_ONCE
-        return lax.fori_loop(0, chunks, add_pieces, total)
+        def is_left(state: tuple[Array, Pieces, Blended]) -> Array:
+            return (state[0] < ends[-1]) | state[1].exists[0]
+
+        start = ends[-1] & 0, no_pieces(segments), total
+        return lax.while_loop(is_left, add_pieces, start)[2]
 
     chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
     nothing = _nothing(view, method, edge_count & 0)

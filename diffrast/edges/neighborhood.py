@@ -1,8 +1,13 @@
 """What may lie near a piece of an edge: pixels round it, and faces round faces."""
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+from diffrast.edges.planes import Table, corners_of, edge_values
+
+_STEPS = 8
 
 
 def picked(values: Array, index: Array) -> Array:
@@ -51,3 +56,32 @@ def _across(face: Array, without: Array, neighbors: Array) -> Array:
 def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
     """The faces that are drawn, -1 in place of the others."""
     return jnp.where((face >= 0) & drawn[jnp.maximum(face, 0)], face, -1)
+
+
+def walk(
+    face: Int[Array, " n"],
+    x: Float[Array, " n"],
+    y: Float[Array, " n"],
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+    neighbors: Int[Array, "F 3"],
+    volume: Float[Array, " F"],
+) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
+    """The faces that cover points, found from other faces on the way towards these.
+
+    From face to face across the edge beyond which the point lies; -1 if the surface ends before, or
+    turns away. Also whether the end of the way was reached.
+    """
+
+    def step(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        face, there = state
+        values, _ = edge_values(corners_of(face, faces, pixels), x, y)
+        least = jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
+        side = jnp.where(values[0] == least, 0, jnp.where(values[1] == least, 1, 2))
+        following = neighbors[jnp.maximum(face, 0), side]
+        turns = volume[jnp.maximum(following, 0)] * jnp.sign(volume[jnp.maximum(face, 0)])
+        following = jnp.where((following >= 0) & (turns > 0), following, -1)
+        there = there | (face < 0) | (least >= 0)
+        return stored((jnp.where(there, face, following), there))
+
+    return lax.fori_loop(0, _STEPS, step, (face, face < 0))

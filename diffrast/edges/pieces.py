@@ -201,3 +201,18 @@ def cut(
     inside = jnp.all((pixel >= 0) & (pixel < size), axis=0)
     pixel, range_ = stored((pixel, range_))
     return Pieces(segment, pixel, range_, exists & inside & (range_[0] < range_[1]))
+
+
+def no_pieces(segments: Segments) -> Pieces:
+    """As many as are cut at once, none of which exists."""
+    integer = jnp.zeros(PIECES_AT_ONCE, jnp.int32) + (segments.parts[0] & 0)
+    ends = jnp.stack([integer, integer])
+    return Pieces(integer, ends, ends.astype(segments.range.dtype), integer > 0)
+
+
+def gathered(pieces: Pieces) -> Pieces:
+    """Those that exist first."""
+    slot = jnp.where(pieces.exists, jnp.cumsum(pieces.exists) - 1, pieces.exists.size)
+    order = jnp.zeros_like(slot).at[slot].set(jnp.arange(slot.size), mode="drop")
+    exists = jnp.arange(slot.size) < jnp.sum(pieces.exists)
+    return Pieces(*(column[..., order] for column in pieces[:-1]), exists)

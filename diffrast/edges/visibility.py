@@ -1,32 +1,39 @@
 """What lies on the two sides of a piece of an edge, and which part of it can be seen.
 
 Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
-those round the edge itself, and those round the face at the next pixel beyond it. A piece ends
-where one of them covers it and is nearer; behind it lies the nearest of those that cover a point
-just beyond its middle.
+those round the edge itself, and those round the face at the next pixel beyond it. The first part of
+the piece is looked at here (see `parts`); what is left of it becomes a piece of its own.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import only, picked, pixel_at, pixels_round, ring, ring_of_edge
-from diffrast.edges.pieces import Pieces, Segments, positive_part
+from diffrast.edges.neighborhood import (
+    only,
+    picked,
+    pixel_at,
+    pixels_round,
+    ring,
+    ring_of_edge,
+    walk,
+)
+from diffrast.edges.parts import Candidates, first_part, nearest_behind
+from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.planes import (
     TOLERANCE,
     Columns,
     Table,
-    area,
     corners_of,
-    covers,
     edge_values,
     inverse_depth_slope,
     locate,
     on_edge,
+    size,
 )
 from diffrast.edges.rim import Rim, look_inwards
 
@@ -34,10 +41,10 @@ _BEYOND = 5e-4  # pixels from the edge to the point that shows what is behind it
 _BEFORE = 1e-3  # pixels from the edge to the points that show what hides it, in its face
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
-_TRUSTED = 1.0  # square pixels: beside a face of half this area may lie others that none shows
-_ALONE = 6.0  # square pixels: the same, where the background is not seen near by
+_FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
+_DUST = 0.5  # pixels: beside faces narrower than that may lie others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
-_ROUNDS = 3  # faces one behind the other along one piece
+_SHORT = 1e-3  # pixels: no piece is left that is shorter
 
 BACKGROUND = -2
 
@@ -71,10 +78,14 @@ def look(
     faces: Int[Array, "F 3"],
     pixels: Table,
     topology: Topology,
-    drawn: Bool[Array, " F"],
+    volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
-) -> Seen:
-    """Find out what is seen beside pieces. `face_image` has a border of one pixel all round."""
+) -> tuple[Seen, Pieces]:
+    """What is seen beside the first visible parts of pieces, and what is left of the pieces.
+
+    `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
+    one pixel all round.
+    """
     own, own_corners, fold, weights, ends, range_ = stored(
         (
             segments.faces[:, pieces.segment],
@@ -90,6 +101,7 @@ def look(
     centre = pieces.pixel + 0.5
     start, along = ends[0] - centre, ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
+    is_bare = jnp.any(face_image < 0)
     inverse_length = 1 / jnp.where(length > 0, length, 1)
     normal = jnp.stack([along[1] * inverse_length, -along[0] * inverse_length])
     start, normal, length = stored((start, normal, length))
@@ -113,41 +125,48 @@ def look(
     pictured = stored(pixels_round(face_image, *pieces.pixel))
     outside = stored(picked(pictured, pixel_at(start + t * along, out, _LOOK)))
     rings = [ring_of_edge(own, topology.neighbors), ring(outside, topology.neighbors)]
-    around = stored(jnp.concatenate([pictured, only(jnp.concatenate(rings), drawn)]))
+    around = stored(jnp.concatenate([pictured, only(jnp.concatenate(rings), volume != 0)]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
-    candidates = corners_of(around, faces, pixels)
 
-    # What nothing hides, seen from just inside.
-    inset = -jnp.minimum(_BEFORE, thickness / 2) * out
-    x, y = (ends[0] + inset)[:, None] + pieces.range * along[:, None]
-    values, depth = edge_values(candidates[:, :, None], x[:, None], y[:, None])
-    margin = depth - (inverse_depth(pieces.range) * (1 + TOLERANCE))[:, None]
-    low, high = _unhidden(foreign, *zip(*[*values, margin], strict=True))
-    span = pieces.range[1] - pieces.range[0]
-    low, high = stored((pieces.range[0] + low * span, pieces.range[0] + high * span))
-    visible = pieces.exists & (low < high)
-    t = stored((low + high) / 2)
+    # Seen from just inside, and from just beyond.
+    offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
+    x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
+    points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
+    values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
+    margin = stored(depth - (inverse_depth(pieces.range) * (1 + TOLERANCE))[:, None])
+    candidates = Candidates(
+        face=around,
+        foreign=foreign,
+        hides=[*(value[0] for value in values), margin[0]],
+        behind=[*(value[1] for value in values), -margin[1]],
+        inverse_depth=depth[1],
+    )
+    part = first_part(candidates, fold, topology.patches)
+    half = stored((part.begin + part.end) / 2)
+    first, last = pieces.range
+    low, high, end, t = (first + at * (last - first) for at in (*part, half))
+    exists = pieces.exists & (low < high)
+    left = pieces._replace(
+        range=jnp.stack([high, end]), exists=exists & ((end - high) * length > _SHORT)
+    )
+    visible, low, high, t, left = stored((exists, low, high, t, left))
     begin, end, middle = stored([start + at * along for at in (low, high, t)])
     near = stored(inverse_depth(t))
 
     # What is behind.
-    x, y = centre + middle + _BEYOND * out
-    values, depth = edge_values(candidates, x, y)
-    behind = foreign & covers(values) & (depth <= near * (1 + TOLERANCE))
-    candidate = stored(jnp.where(behind, depth, 0))
-    nearest = stored(jnp.max(candidate, axis=0))
-    number = jnp.arange(candidate.shape[0])[:, None]
-    best = stored(jnp.min(jnp.where(candidate == nearest, number, number.size), axis=0))
-    best = jnp.minimum(best, number.size - 1)
+    nearest, best = (rows[0] for rows in nearest_behind(candidates, half[None]))
     found = fold & (nearest > 0)
     beyond = jnp.where(fold, jnp.where(found, picked(around, best), -1), other)
     beyond = stored(beyond)
-    _, at_beyond = locate(corners_of(beyond, faces, pixels), x, y)
+    x, y = stored(centre + middle + _BEYOND * out)
 
     # Pixels whose centres lie on either side. What the rasteriser shows of an edge that passes
     # through a centre tells on which side that is.
     to_right = -(middle[0] * normal[0] + middle[1] * normal[1])
-    is_beyond = jnp.where(pictured[4] == beyond, 1, jnp.where(pictured[4] == front, -1, 0))
+    depths = depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9])
+    farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + TOLERANCE) < near))
+    farther = (pictured[4] == beyond) | (fold & farther)
+    is_beyond = jnp.where(pictured[4] == front, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
     shift = stored(jnp.where(close, outward * is_beyond * _SNAPPED - to_right, 0))
     centre_depth = -outward * (to_right + shift)
@@ -156,22 +175,30 @@ def look(
     front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
-    size = stored(area(candidates[:, :, :9]))
-    above = (size < _TRUSTED) & foreign[:9] & (depth[:9] > near * (1 + TOLERANCE))
+    twice_area, width = stored(size(corners_of(pictured, faces, pixels)))
+    above = (twice_area < _FINE) & foreign[:9] & (depths > near * (1 + TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
-    # A face that is found may be shown by another pixel. Where none is known to be behind, though
-    # the face at the pixel beyond is too large for others to lie unseen between, there is none.
+    # Where nothing is found behind, and the surface at the pixel beyond ends before, it is bare.
     shown = stored(picked(pictured, beyond_look))
-    elsewhere = found & (best < 9) & (shown != beyond)
+    search = fold & ~found
+    reached, there = walk(
+        jnp.where(search, shown, -1), x, y, faces, pixels, topology.neighbors, volume
+    )
+    values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
+    lies = search & there & (reached >= 0) & (reached_depth <= near * (1 + TOLERANCE))
     bare = pictured < 0
-    any_bare = jnp.any(bare, axis=0)
-    trusted = jnp.where(any_bare, _TRUSTED, _ALONE)
-    gap = fold & ~found & (shown >= 0) & (picked(size, beyond_look) > trusted)
-    bare_look = jnp.where(any_bare, jnp.argmax(bare, axis=0), front_look)
-    beyond = jnp.where(gap, BACKGROUND, beyond)
-    beyond_look = jnp.where(gap, bare_look, jnp.where(elsewhere, best, beyond_look))
-    beyond, beyond_look = stored((beyond, beyond_look))
+    bare_look = jnp.min(jnp.where(bare, jnp.arange(9)[:, None], 9), axis=0)
+    gap = search & there & (reached < 0) & (shown >= 0) & is_bare
+    bare_look = jnp.where(bare_look < 9, bare_look, front_look)
+    beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached, beyond)))
+    _, at_beyond = locate(corners_of(beyond, faces, pixels), x, y)
+
+    # What the sides show may be seen at another pixel.
+    patch = stored(jnp.where(bare, -1, topology.patches[jnp.maximum(pictured, 0)]))
+    front_shown = stored(_where_shown(front, front_look, patch, topology.patches))
+    beyond_look = _where_shown(beyond, beyond_look, patch, topology.patches)
+    beyond_look = stored(jnp.where(gap, bare_look, beyond_look))
 
     s = t * weights[1] / jnp.where(near > 0, near, 1)
     s = stored(range_[0] + s * (range_[1] - range_[0]))
@@ -195,11 +222,11 @@ def look(
     shown = picked(pictured, beyond_look)
     same = topology.patches[jnp.maximum(shown, 0)] == topology.patches[jnp.maximum(front, 0)]
     flap = fold & ~rim.smooth & (beyond == -1) & (shown >= 0) & same
-    return Seen(
+    seen = Seen(
         visible=visible & ~flap,
         fold=fold,
         front_on_right=front_on_right,
-        front=Side(front, on_edge(front_corners, s), front_look),
+        front=Side(front, on_edge(front_corners, s), front_shown),
         beyond=Side(beyond, at_beyond, beyond_look),
         rim=rim,
         centre_depth=centre_depth,
@@ -207,26 +234,14 @@ def look(
         end=end,
         middle=t,
     )
+    return seen, left
 
 
-def _unhidden(
-    foreign: Array, first: tuple[Array, ...], last: tuple[Array, ...]
-) -> tuple[Array, Array]:
-    """What is left of pieces, 0 to 1, once faces at their ends have hidden as much as they can.
-
-    A face hides what all values, which change linearly from `first` to `last`, are positive for.
-    """
-    low, high = positive_part(first, last)
-    hides = foreign & (low < high)
-
-    def hide(_: Array, left: tuple[Array, Array]) -> tuple[Array, Array]:
-        begin, end = left
-        begin = jnp.maximum(begin, jnp.max(jnp.where(hides & (low <= begin), high, 0), axis=0))
-        end = jnp.minimum(end, jnp.min(jnp.where(hides & (high >= end), low, 1), axis=0))
-        return begin, end
-
-    nothing = jnp.min(low, axis=0)
-    return lax.fori_loop(0, _ROUNDS, hide, (jnp.zeros_like(nothing), jnp.ones_like(nothing)))
+def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Array:
+    """Which of the 3×3 pixels shows the surface of a face: `look` if it does, or if none does."""
+    same = (face >= 0) & (patch == patches[jnp.maximum(face, 0)])
+    first = jnp.min(jnp.where(same, jnp.arange(9)[:, None], 9), axis=0)
+    return jnp.where(picked(same, look) | (first == 9), look, first)
 
 
 def _thickness(
