@@ -268,6 +268,8 @@ def _with_pieces(
             area[:, None] * (behind - near) + length[:, None] * mean,
             area[:, None] * jump,
         )
+        own = flat[_place(view, pieces.pixel, 4)]
+        value = jnp.where(found.wrong_side[:, None], value + front - own, value)
     jump, value, front, behind = stored((jump, value, front, behind))
     size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
     used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))

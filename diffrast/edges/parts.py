@@ -23,6 +23,7 @@ class Candidates(NamedTuple):
     """Faces near pieces, and values at both ends of these that change linearly in between."""
 
     face: Int[Array, "candidates n"]
+    patch: Int[Array, "candidates n"]  # see `Topology`
     foreign: Bool[Array, "candidates n"]  # there is one, and the edge is not its own
     hides: Columns  # all positive where a face hides the piece; (2 ends, candidates, n)
     behind: Columns  # all positive where it lies behind
@@ -37,13 +38,12 @@ class Part(NamedTuple):
     last: Float[Array, " n"]  # end of what is visible; behind `end` there may be other parts
 
 
-def first_part(candidates: Candidates, fold: Bool[Array, " n"], patches: Int[Array, " F"]) -> Part:
+def first_part(candidates: Candidates, fold: Bool[Array, " n"]) -> Part:
     """The first part of pieces that nothing hides, with one surface behind it if it is a fold."""
     begin, end, last = _unhidden(candidates)
-    patch = stored(patches[jnp.maximum(candidates.face, 0)])
     t = stored(begin + jnp.array([_SLIVER, 0.5, 1 - _SLIVER])[:, None] * (end - begin))
     depth, best = nearest_behind(candidates, t)
-    surface = jnp.where(depth > 0, jnp.take_along_axis(patch, best, axis=0), -1)
+    surface = jnp.where(depth > 0, jnp.take_along_axis(candidates.patch, best, axis=0), -1)
 
     # What is seen at the beginning and end of the part's first half, or of its second.
     half = jnp.where(surface[0] != surface[1], 0, 1)
@@ -53,7 +53,7 @@ def first_part(candidates: Candidates, fold: Bool[Array, " n"], patches: Int[Arr
     ends_first = one[1] >= other[1]
     nearer = stored(jnp.where(ends_first, one[2], other[2]))
     low, high = positive_part(*zip(*candidates.behind, strict=True))
-    reaches = candidates.foreign & (patch == nearer) & (low < high)
+    reaches = candidates.foreign & (candidates.patch == nearer) & (low < high)
     left = jnp.max(jnp.where(reaches & (low <= other[0]), high, 0), axis=0)
     entered = jnp.min(jnp.where(reaches & (high >= one[0]), low, 1), axis=0)
     change = jnp.where(ends_first, left, entered)

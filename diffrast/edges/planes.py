@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 
-TOLERANCE = 1e-3  # of 1/w: surfaces nearer to one another than this touch
+TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
+FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
 
 Columns = list[Float[Array, "*n"]]
 Table = Float[Array, "4 V"]  # vertices in homogeneous pixel coordinates x, y, z, w
@@ -64,15 +65,12 @@ def inverse_depth_slope(corners: Array, direction: Array) -> Array:
     return jnp.where(volume == 0, 0, (gx * direction[0] + gy * direction[1]) / safe)
 
 
-def size(corners: Array) -> tuple[Array, Array]:
-    """Twice the area of faces on the screen, and their least width; infinite behind the camera."""
+def area(corners: Array) -> Array:
+    """Twice the area of faces on the screen; infinite if they reach behind the camera."""
     before = jnp.all(corners[2] > 0, axis=0)
     x, y = corners[:2] / jnp.where(before, corners[2], 1)
-    twice = abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
-    sides = [(x[i] - x[i - 1]) ** 2 + (y[i] - y[i - 1]) ** 2 for i in range(3)]
-    longest = jnp.sqrt(jnp.maximum(jnp.maximum(sides[0], sides[1]), sides[2]))
-    width = twice / jnp.where(longest > 0, longest, 1)
-    return jnp.where(before, twice, jnp.inf), jnp.where(before, width, jnp.inf)
+    twice = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+    return jnp.where(before, abs(twice), jnp.inf)
 
 
 def on_edge(edge: Int[Array, " n"], s: Array) -> Columns:

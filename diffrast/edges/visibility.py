@@ -25,15 +25,16 @@ from diffrast.edges.neighborhood import (
 from diffrast.edges.parts import Candidates, first_part, nearest_behind
 from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.planes import (
+    FINE_TOLERANCE,
     TOLERANCE,
     Columns,
     Table,
+    area,
     corners_of,
     edge_values,
     inverse_depth_slope,
     locate,
     on_edge,
-    size,
 )
 from diffrast.edges.rim import Rim, look_inwards
 
@@ -42,7 +43,6 @@ _BEFORE = 1e-3  # pixels from the edge to the points that show what hides it, in
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
-_DUST = 0.5  # pixels: beside faces narrower than that may lie others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 _SHORT = 1e-3  # pixels: no piece is left that is shorter
 
@@ -66,6 +66,7 @@ class Seen(NamedTuple):
     front: Side
     beyond: Side
     rim: Rim
+    wrong_side: Bool[Array, " n"]  # the centre lies on the edge and shows the face that front hides
     centre_depth: Float[Array, " n"]  # of the pixel's centre in front of the piece, negative beyond
     begin: Float[Array, "2 n"]  # ends of the part, from the pixel's centre
     end: Float[Array, "2 n"]
@@ -111,7 +112,8 @@ def look(
 
     # Of two faces of a fold, the one that comes nearer away from the edge is seen.
     inward = jnp.where(first_on_right, normal, -normal)
-    slopes = inverse_depth_slope(corners_of(own, faces, pixels), inward[:, None])
+    face_corners = corners_of(own, faces, pixels)
+    slopes = inverse_depth_slope(face_corners, inward[:, None])
     use_first = (own[0] >= 0) & (~fold | (own[1] < 0) | (slopes[0] >= slopes[1]))
     front, other = jnp.where(use_first, own, own[::-1])
     front_corners, other_corners = jnp.where(use_first, own_corners, own_corners[::-1])
@@ -133,15 +135,20 @@ def look(
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
     values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
-    margin = stored(depth - (inverse_depth(pieces.range) * (1 + TOLERANCE))[:, None])
+    patch = stored(topology.patches[jnp.maximum(around, 0)])
+    fine = jnp.min(area(face_corners), axis=0) < _FINE
+    touching = (patch == topology.patches[jnp.maximum(front, 0)]) | fine
+    tolerance = stored(jnp.where(touching, FINE_TOLERANCE, TOLERANCE))
+    margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
         face=around,
+        patch=patch,
         foreign=foreign,
         hides=[*(value[0] for value in values), margin[0]],
         behind=[*(value[1] for value in values), -margin[1]],
         inverse_depth=depth[1],
     )
-    part = first_part(candidates, fold, topology.patches)
+    part = first_part(candidates, fold)
     half = stored((part.begin + part.end) / 2)
     first, last = pieces.range
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
@@ -164,19 +171,22 @@ def look(
     # through a centre tells on which side that is.
     to_right = -(middle[0] * normal[0] + middle[1] * normal[1])
     depths = depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9])
-    farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + TOLERANCE) < near))
+    farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + FINE_TOLERANCE) < near))
     farther = (pictured[4] == beyond) | (fold & farther)
-    is_beyond = jnp.where(pictured[4] == front, -1, jnp.where(farther, 1, 0))
+    wrong_side = fold & (pictured[4] >= 0) & (pictured[4] == other)
+    nearer = (pictured[4] == front) | wrong_side
+    is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
     shift = stored(jnp.where(close, outward * is_beyond * _SNAPPED - to_right, 0))
     centre_depth = -outward * (to_right + shift)
+    wrong_side = wrong_side & close
     begin, end, centre_depth = stored((begin - shift * normal, end - shift * normal, centre_depth))
     beyond_centre = centre_depth < 0
     front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
-    twice_area, width = stored(size(corners_of(pictured, faces, pixels)))
-    above = (twice_area < _FINE) & foreign[:9] & (depths > near * (1 + TOLERANCE))
+    fine = stored(area(corners_of(pictured, faces, pixels))) < _FINE
+    above = fine & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # Where nothing is found behind, and the surface at the pixel beyond ends before, it is bare.
@@ -186,7 +196,7 @@ def look(
         jnp.where(search, shown, -1), x, y, faces, pixels, topology.neighbors, volume
     )
     values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
-    lies = search & there & (reached >= 0) & (reached_depth <= near * (1 + TOLERANCE))
+    lies = search & there & (reached >= 0) & (reached_depth <= near * (1 + FINE_TOLERANCE))
     bare = pictured < 0
     bare_look = jnp.min(jnp.where(bare, jnp.arange(9)[:, None], 9), axis=0)
     gap = search & there & (reached < 0) & (shown >= 0) & is_bare
@@ -195,7 +205,7 @@ def look(
     _, at_beyond = locate(corners_of(beyond, faces, pixels), x, y)
 
     # What the sides show may be seen at another pixel.
-    patch = stored(jnp.where(bare, -1, topology.patches[jnp.maximum(pictured, 0)]))
+    patch = jnp.where(bare, -1, patch[:9])
     front_shown = stored(_where_shown(front, front_look, patch, topology.patches))
     beyond_look = _where_shown(beyond, beyond_look, patch, topology.patches)
     beyond_look = stored(jnp.where(gap, bare_look, beyond_look))
@@ -229,6 +239,7 @@ def look(
         front=Side(front, on_edge(front_corners, s), front_shown),
         beyond=Side(beyond, at_beyond, beyond_look),
         rim=rim,
+        wrong_side=wrong_side,
         centre_depth=centre_depth,
         begin=begin,
         end=end,
