@@ -42,6 +42,7 @@ ORDER = [
     "diffrast.raster",
     "diffrast.edges.pieces",
     "diffrast.edges.planes",
+    "diffrast.edges.parts",
     "diffrast.edges.neighborhood",
     "diffrast.edges.rim",
     "diffrast.edges.visibility",

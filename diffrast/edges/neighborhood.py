@@ -36,17 +36,6 @@ def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[A
     return jnp.concatenate([near.reshape(4, -1), far.reshape(8, -1)])
 
 
-def ring(face: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "9 n"]:
-    """The faces up to two edges away from a face."""
-    near = _next_to(face, neighbors)
-    far = _across(near, face[None], neighbors)
-    return jnp.concatenate([near, far.reshape(6, -1)])
-
-
-def _next_to(face: Array, neighbors: Array) -> Array:
-    return jnp.where(face >= 0, neighbors.T[:, jnp.maximum(face, 0)], -1)
-
-
 def _across(face: Array, without: Array, neighbors: Array) -> Array:
     """The two faces next to each face that are not `without`, which is one of three or none."""
     near = _next_to(face, neighbors)

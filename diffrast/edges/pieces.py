@@ -215,4 +215,5 @@ def gathered(pieces: Pieces) -> Pieces:
     slot = jnp.where(pieces.exists, jnp.cumsum(pieces.exists) - 1, pieces.exists.size)
     order = jnp.zeros_like(slot).at[slot].set(jnp.arange(slot.size), mode="drop")
     exists = jnp.arange(slot.size) < jnp.sum(pieces.exists)
-    return Pieces(*(column[..., order] for column in pieces[:-1]), exists)
+    segment, pixel, range_, _ = (column[..., order] for column in pieces)
+    return Pieces(segment, pixel, range_, exists)

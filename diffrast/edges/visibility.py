@@ -1,8 +1,9 @@
 """What lies on the two sides of a piece of an edge, and which part of it can be seen.
 
-Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
-those round the edge itself, and those round the face at the next pixel beyond it. The first part of
-the piece is looked at here (see `parts`); what is left of it becomes a piece of its own.
+Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it and
+those round the edge itself. The first part of the piece is looked at here (see `parts`); what is
+left of it becomes a piece of its own. Where no candidate lies behind the part, a walk over the
+surface at the next pixel beyond tells which of its faces does, or that it ends before.
 """
 
 from typing import NamedTuple
@@ -18,7 +19,6 @@ from diffrast.edges.neighborhood import (
     picked,
     pixel_at,
     pixels_round,
-    ring,
     ring_of_edge,
     walk,
 )
@@ -125,9 +125,8 @@ def look(
     t = (pieces.range[0] + pieces.range[1]) / 2
     thickness = stored(_thickness(front, front_corners, faces, pixels, ends[0], normal, length, t))
     pictured = stored(pixels_round(face_image, *pieces.pixel))
-    outside = stored(picked(pictured, pixel_at(start + t * along, out, _LOOK)))
-    rings = [ring_of_edge(own, topology.neighbors), ring(outside, topology.neighbors)]
-    around = stored(jnp.concatenate([pictured, only(jnp.concatenate(rings), volume != 0)]))
+    nearby = only(ring_of_edge(own, topology.neighbors), volume != 0)
+    around = stored(jnp.concatenate([pictured, nearby]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
