@@ -40,8 +40,8 @@ from diffrast.mesh import Mesh as Mesh
 from diffrast.raster import Fragments as Fragments
 from diffrast.raster import rasterize as rasterize
 from diffrast.render import Buffers as Buffers
-from diffrast.render import Object as Object
-from diffrast.render import RenderSettings as RenderSettings
-from diffrast.render import Scene as Scene
 from diffrast.render import render as render
 from diffrast.render import render_buffers as render_buffers
+from diffrast.scene import Object as Object
+from diffrast.scene import Scene as Scene
+from diffrast.settings import RenderSettings as RenderSettings
