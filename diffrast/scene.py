@@ -7,7 +7,7 @@ from jaxtyping import Float
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass, set_field
-from diffrast.light import AmbientLight, DirectionalLight, Light, PointLight
+from diffrast.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
 from diffrast.material import Material
 from diffrast.mesh import Mesh
 
@@ -65,7 +65,7 @@ class Scene:
     ) -> None:
         for name, items, kinds in (
             ("objects", objects, (Object,)),
-            ("lights", lights, (AmbientLight, DirectionalLight, PointLight)),
+            ("lights", lights, (AmbientLight, DirectionalLight, PointLight, SpotLight)),
         ):
             if not isinstance(items, tuple | list):
                 raise ValueError(f"{name}: wanted a tuple or list, got {type(items).__name__}")

@@ -302,8 +302,9 @@ def render_phong(
     Args:
         positions_world, normals: (V, 3). faces: (F, 3).
         view, projection: 4x4, world to eye and eye to clip space.
-        lights: dicts with "type" "ambient", "directional" ("direction" of travel) or "point"
-            ("position"), and RGB "ambient", "diffuse", "specular", each zero unless given.
+        lights: dicts with "type" "ambient", "directional" ("direction" of travel), "point"
+            ("position") or "spot" ("position", "direction", "cutoff"), and RGB "ambient",
+            "diffuse", "specular", each zero unless given.
         material: dict of RGB "ambient", "diffuse", "specular" and "shininess". Each value may
             also be an array of one entry a face.
         background: RGB.
@@ -365,6 +366,10 @@ def shade(points, normals, to_viewer, lights, material, specular="phong") -> np.
         if light["type"] == "ambient":
             continue
         to_light = _towards_light(light, points)
+        if light["type"] == "spot":
+            fade = spot_fade(light, to_light)[:, None]
+            strength["diffuse"] = strength["diffuse"] * fade
+            strength["specular"] = strength["specular"] * fade
         cosine = np.sum(normals * to_light, axis=-1, keepdims=True)
         if specular == "phong":
             reflected = 2 * cosine * normals - to_light
@@ -382,6 +387,12 @@ def _towards_light(light, points) -> np.ndarray:
     if light["type"] == "directional":
         return np.broadcast_to(-normalize(np.asarray(light["direction"], float)), points.shape)
     return normalize(np.asarray(light["position"], float) - points)
+
+
+def spot_fade(light, to_light) -> np.ndarray:
+    """1 - (1 - cos a) / (1 - cos cutoff) inside the cone of a spot light, 0 outside."""
+    cosine = -to_light @ normalize(np.asarray(light["direction"], float))
+    return np.maximum(1 - (1 - cosine) / (1 - np.cos(float(light["cutoff"]))), 0)
 
 
 def _at_faces(material, face) -> dict[str, np.ndarray]:

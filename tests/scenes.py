@@ -178,7 +178,11 @@ class Oracle:
         return {k: np.asarray(values, float)[self.object_of_face] for k, values in table.items()}
 
     def _lights(self):
-        kinds = {dr.DirectionalLight: "directional", dr.PointLight: "point"}
+        kinds = {
+            dr.DirectionalLight: "directional",
+            dr.PointLight: "point",
+            dr.SpotLight: "spot",
+        }
         lights = []
         for light in self.scene.lights:
             if isinstance(light, dr.AmbientLight):

@@ -446,7 +446,7 @@ MESH = shapes.cube
         (lambda: dr.Scene(objects=[MESH()]), r"objects\[0\]: wanted Object, got Mesh"),
         (
             lambda: dr.Scene(objects=[], lights=[dr.AmbientLight((1, 1, 1)), "sun"]),
-            r"lights\[1\]: wanted AmbientLight or DirectionalLight or PointLight, got str",
+            r"lights\[1\]: wanted AmbientLight or DirectionalLight or .* or SpotLight, got str",
         ),
         (lambda: dr.Scene(objects=[], background=(1, 1)), r"background: wanted shape \(3,\) or"),
         (lambda: dr.Scene(objects=[], background=np.ones((2, 3))), "background: wanted shape"),
