@@ -35,6 +35,7 @@ from diffrast.interpolate import interpolate as interpolate
 from diffrast.light import AmbientLight as AmbientLight
 from diffrast.light import DirectionalLight as DirectionalLight
 from diffrast.light import PointLight as PointLight
+from diffrast.light import Shadow as Shadow
 from diffrast.light import SpotLight as SpotLight
 from diffrast.material import Material as Material
 from diffrast.mesh import Mesh as Mesh

@@ -5,6 +5,7 @@ does not have (`None`) adds no operation: a light without `ambient` adds no ambi
 `AmbientLight` costs one addition.
 """
 
+import copy
 import math
 from typing import TypeAlias
 
@@ -12,8 +13,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, real_number
-from diffrast._pytree import pytree_dataclass, set_field
+from diffrast._check import ArrayInput, float_array, positive_int, real_number
+from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.linalg import normalize
 
 Columns: TypeAlias = list[Array]  # x, y, z (or r, g, b), each of any one shape
@@ -30,6 +31,28 @@ class AmbientLight:
 
 
 @pytree_dataclass
+class Shadow:
+    """That a light casts shadows: what it cannot see gets its ambient part only (FEATURES S5).
+
+    Attributes:
+        resolution: rows and columns of the picture that the light takes of the scene, static. It is
+            fitted to what the camera sees. Outlines of faces that several of its pixels show are
+            exact whatever the resolution; what falls between its pixels casts no shadow.
+
+    Raises:
+        ValueError: for anything but an integer from 8 to 8192.
+    """
+
+    resolution: int = static(default=512)
+
+    def __post_init__(self) -> None:
+        resolution = positive_int("resolution", self.resolution, minimum=8)
+        if resolution > 8192:
+            raise ValueError(f"resolution: wanted at most 8192, got {resolution}")
+        set_field(self, "resolution", resolution)
+
+
+@pytree_dataclass
 class DirectionalLight:
     """Light from infinitely far away.
 
@@ -38,6 +61,7 @@ class DirectionalLight:
         diffuse: (3,) linear RGB.
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None.
+        shadow: how it casts shadows, or None for none.
 
     Raises:
         ValueError: for wrong shapes and numbers that are not finite.
@@ -47,6 +71,7 @@ class DirectionalLight:
     diffuse: Float[Array, "3"]
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
+    shadow: Shadow | None
 
     def __init__(
         self,
@@ -55,9 +80,11 @@ class DirectionalLight:
         ambient: ArrayInput | None = None,
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
+        shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "direction", float_array("direction", direction, (3,)))
         _set_colors(self, ambient, diffuse, specular)
+        _set_shadow(self, shadow)
 
 
 @pytree_dataclass
@@ -71,6 +98,7 @@ class PointLight:
         ambient: (3,) or None.
         attenuation: (3,) a, b, c: diffuse and specular light is divided by a + b r + c r² at the
             distance r; None for no attenuation.
+        shadow: how it casts shadows, or None for none.
 
     Raises:
         ValueError: for wrong shapes and numbers that are not finite.
@@ -81,6 +109,7 @@ class PointLight:
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
     attenuation: Float[Array, "3"] | None
+    shadow: Shadow | None
 
     def __init__(
         self,
@@ -90,9 +119,11 @@ class PointLight:
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
         attenuation: ArrayInput | None = None,
+        shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "position", float_array("position", position, (3,)))
         _set_colors(self, ambient, diffuse, specular)
+        _set_shadow(self, shadow)
         _set_attenuation(self, attenuation)
 
 
@@ -112,6 +143,7 @@ class SpotLight:
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None; inside and outside of the cone alike.
         attenuation: (3,) or None, as a `PointLight`'s.
+        shadow: how it casts shadows, or None for none.
 
     Raises:
         ValueError: for wrong shapes, numbers that are not finite, and a cutoff out of range.
@@ -124,6 +156,7 @@ class SpotLight:
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
     attenuation: Float[Array, "3"] | None
+    shadow: Shadow | None
 
     def __init__(
         self,
@@ -135,11 +168,13 @@ class SpotLight:
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
         attenuation: ArrayInput | None = None,
+        shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "position", float_array("position", position, (3,)))
         set_field(self, "direction", float_array("direction", direction, (3,)))
         set_field(self, "cutoff", real_number("cutoff", cutoff, above=0.0, below=math.pi / 2))
         _set_colors(self, ambient, diffuse, specular)
+        _set_shadow(self, shadow)
         _set_attenuation(self, attenuation)
 
 
@@ -168,11 +203,29 @@ def _set_attenuation(light: PointLight | SpotLight, attenuation: ArrayInput | No
     set_field(light, "attenuation", attenuation)
 
 
+def _set_shadow(light: ShiningLight, shadow: Shadow | None) -> None:
+    if shadow is not None and not isinstance(shadow, Shadow):
+        raise ValueError(f"shadow: wanted a Shadow or None, got {type(shadow).__name__}")
+    set_field(light, "shadow", shadow)
+
+
 def total_ambient(lights: tuple[Light, ...]) -> Float[Array, "3"] | None:
     """Sum of the lights' ambient colours; None if no light has one."""
     colors = [light.color if isinstance(light, AmbientLight) else light.ambient for light in lights]
     present = [color for color in colors if color is not None]
     return sum(present[1:], start=present[0]) if present else None
+
+
+def without_ambient(light: ShiningLight) -> ShiningLight:
+    """The light without its ambient part."""
+    other = copy.copy(light)
+    set_field(other, "ambient", None)
+    return other
+
+
+def casts_shadow(light: Light) -> bool:
+    """Whether the light casts shadows."""
+    return not isinstance(light, AmbientLight) and light.shadow is not None
 
 
 def needs_position(light: Light) -> bool:

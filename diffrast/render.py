@@ -16,7 +16,6 @@ from diffrast._stored import assemble, stored
 from diffrast.camera import Camera
 from diffrast.edges import Shader, View, antialias_image
 from diffrast.geometry import (
-    Geometry,
     Points,
     apart_edges,
     at_points,
@@ -26,11 +25,11 @@ from diffrast.geometry import (
     visible_points,
     world_geometry,
 )
-from diffrast.light import Columns, normalize_columns
+from diffrast.light import Columns, casts_shadow, normalize_columns
 from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
-from diffrast.surface import SHADERS
+from diffrast.surface import SHADERS, World, lit_world, reach
 
 
 class Buffers(NamedTuple):
@@ -44,6 +43,8 @@ class Buffers(NamedTuple):
         position: world position of the visible point.
         normal: unit world normal as the shading uses it.
         uv: texture coordinates, None if no mesh has any.
+        lit: for each light that casts shadows, in the scene's order, 1 where it reaches the visible
+            point and 0 elsewhere; None if there is no such light.
     """
 
     face: Int[Array, "height width"]
@@ -53,6 +54,7 @@ class Buffers(NamedTuple):
     position: Float[Array, "height width 3"]
     normal: Float[Array, "height width 3"]
     uv: Float[Array, "height width 2"] | None
+    lit: Float[Array, "height width lights"] | None
 
 
 @jax.jit
@@ -97,13 +99,14 @@ def render(
             background = jnp.pad(background, ((1, 1), (1, 1), (0, 0)), mode="edge")
     pixels = visible_points(geometry, seen_clip, *size, settings.cull_backfaces)
     with jax.named_scope("shade"):
-        color = SHADERS[settings.shading](scene, camera, geometry, pixels)
+        world = lit_world(scene, camera, geometry, pixels, settings.shading)
+        color = SHADERS[settings.shading](world, pixels)
         covered = pixels.face >= 0
         color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
     if settings.antialias:
         with jax.named_scope("edges"):
             image = assemble(stored(color))
-            image = _with_edges(image, scene, camera, geometry, clip, pixels, background, settings)
+            image = _with_edges(image, world, clip, pixels, background, settings)
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]
@@ -122,7 +125,9 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
     if not scene.objects:
         three = jnp.zeros((*size, 3), scene.background.dtype)
         nothing = jnp.full(size, -1, jnp.int32)
-        return Buffers(nothing, nothing, three, three[..., 0], three, three, None)
+        shadows = sum(map(casts_shadow, scene.lights))
+        lit = jnp.zeros((*size, shadows), three.dtype) if shadows else None
+        return Buffers(nothing, nothing, three, three[..., 0], three, three, None, lit)
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
     pixels = visible_points(geometry, clip, *size, settings.cull_backfaces)
@@ -130,6 +135,9 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         columns = flat_normals(geometry, pixels.face)
     else:
         columns = at_points(geometry.normals, geometry, pixels)
+    lighting = "flat" if settings.shading == "unlit" else settings.shading
+    world = lit_world(scene, camera, geometry, pixels, lighting)
+    reached = [part for part in reach(world, pixels) if part is not None]
     normal, _ = normalize_columns(columns)
     covered = pixels.face >= 0
     object_of_face = geometry.object_of_face[jnp.maximum(pixels.face, 0)]
@@ -145,20 +153,20 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         position=stacked(at_points(geometry.positions, geometry, pixels)),
         normal=stacked(normal),
         uv=None if geometry.uvs is None else stacked(at_points(geometry.uvs, geometry, pixels)),
+        lit=stacked(reached) if reached else None,
     )
 
 
 def _with_edges(
     image: Array,
-    scene: Scene,
-    camera: Camera,
-    geometry: Geometry,
+    world: World,
     positions_clip: Array,
     pixels: Points,
     background: Array,
     settings: RenderSettings,
 ) -> Array:
-    topology = scene_topology(scene, geometry)
+    geometry = world.geometry
+    topology = scene_topology(world.scene, geometry)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
     view = View(
@@ -170,7 +178,7 @@ def _with_edges(
         face_image=pixels.face,
         image=image,
         background=background,
-        scene=(scene, camera, geometry),
+        scene=world,
     )
     return antialias_image(
         view,
@@ -180,10 +188,8 @@ def _with_edges(
 
 
 def _shade_points(shading: str) -> Shader:
-    def shade(seen: tuple[Scene, Camera, Geometry], face: Array, at: Columns) -> Columns:
-        scene, camera, geometry = seen
-        no_depth = jnp.zeros_like(at[0])
-        return SHADERS[shading](scene, camera, geometry, Points(face, at, no_depth))
+    def shade(world: World, face: Array, at: Columns) -> Columns:
+        return SHADERS[shading](world, Points(face, at, jnp.zeros_like(at[0])))
 
     return shade
 
