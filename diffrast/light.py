@@ -7,7 +7,7 @@ does not have (`None`) adds no operation: a light without `ambient` adds no ambi
 
 import copy
 import math
-from typing import TypeAlias
+from typing import TypeAlias, TypeGuard
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -223,7 +223,7 @@ def without_ambient(light: ShiningLight) -> ShiningLight:
     return other
 
 
-def casts_shadow(light: Light) -> bool:
+def casts_shadow(light: Light) -> TypeGuard[ShiningLight]:
     """Whether the light casts shadows."""
     return not isinstance(light, AmbientLight) and light.shadow is not None
 

@@ -29,7 +29,7 @@ from diffrast.light import Columns, casts_shadow, normalize_columns
 from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
-from diffrast.surface import SHADERS, World, lit_world, reach
+from diffrast.surface import SHADERS, World, cast_shadows, receive_shadows
 
 
 class Buffers(NamedTuple):
@@ -99,8 +99,8 @@ def render(
             background = jnp.pad(background, ((1, 1), (1, 1), (0, 0)), mode="edge")
     pixels = visible_points(geometry, seen_clip, *size, settings.cull_backfaces)
     with jax.named_scope("shade"):
-        world = lit_world(scene, camera, geometry, pixels, settings.shading)
-        color = SHADERS[settings.shading](world, pixels)
+        world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
+        color = SHADERS[settings.shading](world, pixels, reached)
         covered = pixels.face >= 0
         color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
     if settings.antialias:
@@ -136,8 +136,8 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
     else:
         columns = at_points(geometry.normals, geometry, pixels)
     lighting = "flat" if settings.shading == "unlit" else settings.shading
-    world = lit_world(scene, camera, geometry, pixels, lighting)
-    reached = [part for part in reach(world, pixels) if part is not None]
+    _, reached = cast_shadows(scene, camera, geometry, pixels, lighting)
+    lit_parts = [part for part in reached if part is not None]
     normal, _ = normalize_columns(columns)
     covered = pixels.face >= 0
     object_of_face = geometry.object_of_face[jnp.maximum(pixels.face, 0)]
@@ -153,7 +153,7 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         position=stacked(at_points(geometry.positions, geometry, pixels)),
         normal=stacked(normal),
         uv=None if geometry.uvs is None else stacked(at_points(geometry.uvs, geometry, pixels)),
-        lit=stacked(reached) if reached else None,
+        lit=stacked(lit_parts) if lit_parts else None,
     )
 
 
@@ -189,7 +189,8 @@ def _with_edges(
 
 def _shade_points(shading: str) -> Shader:
     def shade(world: World, face: Array, at: Columns) -> Columns:
-        return SHADERS[shading](world, Points(face, at, jnp.zeros_like(at[0])))
+        points = Points(face, at, jnp.zeros_like(at[0]))
+        return SHADERS[shading](world, points, receive_shadows(world, points))
 
     return shade
 

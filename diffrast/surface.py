@@ -18,7 +18,7 @@ from diffrast.light import (
 )
 from diffrast.scene import Scene
 from diffrast.shade import Reflectance, Surface, needs, phong
-from diffrast.shadows import Shadows, cast, receive
+from diffrast.shadows import Reached, Shadows, cast, receive
 
 
 class World(NamedTuple):
@@ -30,46 +30,39 @@ class World(NamedTuple):
     shadows: Shadows
 
 
-def lit_world(
+def cast_shadows(
     scene: Scene, camera: Camera, geometry: Geometry, points: Points, shading: str
-) -> World:
-    """Take the lights' pictures for the shadows at points."""
-    none: Shadows = (None,) * len(scene.lights)
+) -> tuple[World, Reached]:
+    """The world with the shadows that fall on points, and which lights reach those."""
+    none = (None,) * len(scene.lights)
     if shading == "unlit" or not any(map(casts_shadow, scene.lights)):
-        return World(scene, camera, geometry, none)
-    normal = smooth_normals(geometry, points)
-    return World(scene, camera, geometry, cast(scene.lights, geometry, points, normal))
+        return World(scene, camera, geometry, none), none
+    shadows, reached = cast(scene.lights, geometry, points)
+    return World(scene, camera, geometry, shadows), reached
 
 
-def smooth_normals(geometry: Geometry, points: Points) -> Columns | None:
-    """Normals as interpolated by the shading, of any length; None for those of the faces."""
-    if geometry.normals is None:
-        return None
-    return at_points(geometry.normals, geometry, points)
-
-
-def reach(world: World, points: Points) -> list[Array | None]:
-    """For each light whether it reaches points, None if it casts no shadows."""
+def receive_shadows(world: World, points: Points) -> Reached:
+    """Which lights reach points."""
     if all(shadow is None for shadow in world.shadows):
-        return [None] * len(world.shadows)
-    normal = smooth_normals(world.geometry, points)
-    return receive(world.scene.lights, world.shadows, world.geometry, points, normal)
+        return (None,) * len(world.shadows)
+    return receive(world.scene.lights, world.shadows, world.geometry, points)
 
 
-def _shade_phong(world: World, points: Points) -> Columns:
+def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
     scene, camera, geometry, _ = world
-    normal = smooth_normals(geometry, points)
-    if normal is None:
+    if geometry.normals is None:
         normal = flat_normals(geometry, points.face)
+    else:
+        normal = at_points(geometry.normals, geometry, points)
     reflectance = _reflectance(scene, geometry.object_of_face, points.face)
     with_position, with_viewer = needs(scene.lights, reflectance.specular is not None)
     position = at_points(geometry.positions, geometry, points) if with_position else None
     to_viewer = _to_viewer(camera, position) if with_viewer else None
     surface = Surface(normal, position, to_viewer)
-    return phong(surface, reflectance, scene.lights, reach(world, points))
+    return phong(surface, reflectance, scene.lights, reached)
 
 
-def _shade_gouraud(world: World, points: Points) -> Columns:
+def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     """Interpolate the colours of vertices; of each light with shadows apart, which are sharp."""
     scene, camera, geometry, shadows = world
     assert geometry.normals is not None
@@ -94,19 +87,19 @@ def _shade_gouraud(world: World, points: Points) -> Columns:
         if light.ambient is not None:
             everywhere.append(AmbientLight(light.ambient))
     color = at_vertices(tuple(everywhere))
-    parts = [part for part in reach(world, points) if part is not None]
+    parts = [part for part in reached if part is not None]
     for light, part in zip(alone, parts, strict=True):
         color = [c + part * own for c, own in zip(color, at_vertices((light,)), strict=True)]
     return color
 
 
-def _shade_unlit(world: World, points: Points) -> Columns:
+def _shade_unlit(world: World, points: Points, reached: Reached) -> Columns:
     scene, geometry = world.scene, world.geometry
     diffuse = _reflectance(scene, geometry.object_of_face, points.face).diffuse
     return [jnp.broadcast_to(channel, points.face.shape) for channel in diffuse]
 
 
-SHADERS: dict[str, Callable[[World, Points], Columns]] = {
+SHADERS: dict[str, Callable[[World, Points, Reached], Columns]] = {
     "phong": _shade_phong,
     "gouraud": _shade_gouraud,
     "flat": _shade_phong,

@@ -5,6 +5,7 @@
 nothing here is differentiable, and gradients are stopped at the doors.
 """
 
+from diffrast.shadows.cast import Reached as Reached
 from diffrast.shadows.cast import Shadows as Shadows
 from diffrast.shadows.cast import cast as cast
 from diffrast.shadows.cast import receive as receive

@@ -34,8 +34,8 @@ def lit(
     points: Points,
     seen: Seen,
     towards: Bool[Array, "*size"],
-) -> Bool[Array, "*size"]:
-    """Whether the light sees points. Not differentiable: pass stopped gradients.
+) -> Float[Array, "*size"]:
+    """1 at points that the light sees, 0 at others. Not differentiable: pass stopped gradients.
 
     Args:
         light: that casts shadows.
@@ -68,7 +68,8 @@ def lit(
         return bright.at[jnp.where(slots < starts[1], chosen, bright.size)].set(free, mode="drop")
 
     chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
-    return lax.fori_loop(0, chunks, look_closer, bright).reshape(shape)
+    bright = lax.fori_loop(0, chunks, look_closer, bright).reshape(shape)
+    return bright.astype(key.dtype)
 
 
 class Place(NamedTuple):
@@ -84,11 +85,17 @@ class Place(NamedTuple):
 
 def _texel_of(shadow_map: ShadowMap, seen: Seen) -> Place:
     size = shadow_map.face.shape[1]
-    scale_x, scale_y, offset_x, offset_y = shadow_map.window[:, seen.side]
+    scale_x, scale_y, offset_x, offset_y = _windows(shadow_map, seen.side)
     x, y = scale_x * seen.x + offset_x, scale_y * seen.y + offset_y
     column, row = (jnp.clip(jnp.floor(at), 0, size - 1).astype(jnp.int32) for at in (x, y))
     number = (seen.side * size + row) * size + column
     return Place(seen.side, row, column, number, x - (column + 0.5), y - (row + 0.5))
+
+
+def _windows(shadow_map: ShadowMap, side: Array) -> Array:
+    """The windows of each point's picture, four columns."""
+    window = shadow_map.window
+    return window[0] if window.shape[0] == 1 else window.T[:, side]
 
 
 def _at_texels(values: Array, number: Array) -> Array:
@@ -129,7 +136,7 @@ def _blocked(
     ray, corners = stored((ray, (others - origin[:, None, None]) - point[:, None, None]))
     stops = _stops(corners, ray[:, None], endless=is_parallel(light))
     foreign = (around >= 0) & (around != points.face)
-    found = jnp.any(foreign & stops, axis=0)
+    found = jnp.max(jnp.where(foreign, stops, -1), axis=0) > 0
     # Faces too small to be found.
     nearest = around[4]
     slopes, small = _slopes(light, shadow_map, place, others[:, :, 4])
@@ -147,20 +154,20 @@ def _blocked(
 
 
 def _stops(corners: Array, ray: Array, *, endless: bool) -> Array:
-    """Whether faces, given from the beginning of rays, stop them between beginning and end."""
+    """Positive where faces, given from the beginning of rays, stop them before their end."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    one, other = b - a, c - a
-    normal = _cross(one, other)
+    normal = _cross(b - a, c - a)
     along, distance = _dot(normal, ray), _dot(normal, a)
     sign = jnp.where(along < 0, -1, 1)
     inside = along != 0
     for start, end in ((a, b), (b, c), (c, a)):
         inside = inside & (sign * _dot(ray, _cross(start, end)) >= 0)
-    eps = jnp.finfo(corners.dtype).eps
     rounding = _dot(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
-    rounding = rounding * (_ROUNDINGS * eps)
-    stops = inside & (sign * distance > rounding)
-    return stops if endless else stops & (sign * (along - distance) > rounding)
+    rounding = rounding * (_ROUNDINGS * jnp.finfo(corners.dtype).eps)
+    before = sign * distance
+    if not endless:
+        before = jnp.minimum(before, sign * along - before)
+    return stored(jnp.where(inside, before - rounding, -1))
 
 
 def _slopes(
@@ -168,7 +175,7 @@ def _slopes(
 ) -> tuple[list[Array], Array]:
     """How the depth key changes from texel to texel on faces, and whether they are small."""
     x, y, w, k = homogeneous(light, shadow_map.view, place.side, list(corners))
-    scale_x, scale_y, offset_x, offset_y = shadow_map.window[:, place.side]
+    scale_x, scale_y, offset_x, offset_y = _windows(shadow_map, place.side)
     at_x, at_y = place.column + 0.5 + place.x, place.row + 0.5 + place.y
     x = scale_x * x + (offset_x - at_x) * w
     y = scale_y * y + (offset_y - at_y) * w

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import assemble, stored
+from diffrast._stored import assemble, stored, stored_rows
 from diffrast.geometry import Geometry
 from diffrast.light import ShiningLight
+from diffrast.linalg import apply_matrix
 from diffrast.raster.coverage import faces_and_depths
-from diffrast.shadows.views import LightView, Seen, homogeneous, is_parallel, sides
+from diffrast.shadows.views import LightView, Seen, is_parallel, matrices, sides
 
 _BORDER = 2.0  # texels round what is seen
 _SMALLEST = 1e-5  # side of a window, in units of the depth range or of a right angle's tangent
@@ -25,72 +26,88 @@ _SMOOTH = 0.5  # texels
 
 
 class ShadowMap(NamedTuple):
-    """What a light sees, of all its pictures one after another."""
+    """What a light sees."""
 
     view: LightView
-    window: Float[Array, "4 sides"]  # scale of x and y to texels, and their offsets
+    window: Float[Array, "sides 4"]  # scale of x and y to texels, and their offsets
     face: Int[Array, "sides size size"]
     texel: Float[Array, "sides size size 4"]  # key, its slopes along columns and rows, their error
 
 
-def draw_map(
-    light: ShiningLight,
-    view: LightView,
-    geometry: Geometry,
-    seen: Seen,
-    wanted: Bool[Array, "*size"],
-) -> ShadowMap:
-    """Draw what the light sees of the part of the scene that holds the wanted points."""
+class Picture(NamedTuple):
+    """One picture to be taken, or several along the first axis."""
+
+    origin: Float[Array, "*n 3"]
+    clip: Float[Array, "*n 4 4"]  # from (offset from the origin, 1)
+    limit: Float[Array, "*n 2"]  # of a smooth surface's second differences: a + b key
+    wanted: Bool[Array, "*n"]
+
+
+def plan(
+    light: ShiningLight, view: LightView, seen: Seen, wanted: Bool[Array, "*size"]
+) -> tuple[Float[Array, "sides 4"], Picture]:
+    """Fit the light's pictures to the wanted points: their windows, and how to take them."""
     assert light.shadow is not None
-    size = light.shadow.resolution
+    size, count = light.shadow.resolution, sides(light)
+    here = [wanted & (seen.side == side) if count > 1 else wanted for side in range(count)]
+    ranges = [[_range(column, some) for column in (seen.x, seen.y)] for some in here]
+    low, high = jnp.moveaxis(jnp.array(ranges), 2, 0)  # (sides, 2) each
+    some = low[:, 0] <= high[:, 0]
+    low, high = (jnp.where(some[:, None], end, 0) for end in (low, high))
+    smallest = _SMALLEST / (jnp.abs(view.depth) if is_parallel(light) else 1)
+    scale = (size - 2 * _BORDER) / jnp.maximum(high - low, smallest)
+    offset = size / 2 - scale * (low + high) / 2
 
-    def draw(side: Array) -> tuple[Array, Array, Array]:
-        here = wanted & (seen.side == side)
-        window = _fitted(light, view, seen, here, size)
+    x, y, w, k = jnp.moveaxis(matrices(light, view), 1, 0)
+    half = size / 2
+    rows = [
+        (scale[:, :1] * x + offset[:, :1] * w) / half - w,
+        w - (scale[:, 1:] * y + offset[:, 1:] * w) / half,
+        -k if is_parallel(light) else jnp.zeros_like(k),
+        w,
+    ]
+    width = _SMOOTH / jnp.min(scale, axis=1)
+    zero = jnp.zeros_like(width)
+    limit = (width * jnp.abs(view.depth), zero) if is_parallel(light) else (zero, width)
+    picture = Picture(
+        jnp.broadcast_to(view.origin, (count, 3)),
+        jnp.stack(rows, axis=1),
+        jnp.stack(limit, axis=1),
+        some,
+    )
+    return jnp.concatenate([scale, offset], axis=1), picture
 
-        def picture() -> tuple[Array, Array]:
-            columns = [geometry.positions[:, i] for i in range(3)]
-            x, y, w, k = homogeneous(light, view, side, columns)
-            x = 2 * (window[0] * x + window[2] * w) / size - w
-            y = w - 2 * (window[1] * y + window[3] * w) / size
-            z = -k if is_parallel(light) else jnp.zeros_like(k)
-            clip = assemble(stored([x, y, z, w]))
+
+def take(
+    pictures: Picture, geometry: Geometry, size: int
+) -> tuple[Int[Array, "n size size"], Float[Array, "n size size 4"]]:
+    """Faces and texels of pictures, one after another; of unwanted ones nothing."""
+
+    def draw(picture: Picture) -> tuple[Array, Array]:
+        def wanted() -> tuple[Array, Array]:
+            offset = geometry.positions - picture.origin
+            clip = stored_rows(apply_matrix(picture.clip[:, :3], offset) + picture.clip[:, 3])
             face, key = faces_and_depths(clip, geometry.faces, size=size)
-            return face, _texels(light, view, key, window)
+            return face, _texels(key, picture.limit)
 
         def nothing() -> tuple[Array, Array]:
-            zero = window[0] * 0  # varies as the data do
+            zero = picture.origin[0] * 0  # varies as the data do
             face = jnp.full((size, size), -1, jnp.int32) + zero.astype(jnp.int32)
             return face, jnp.zeros((size, size, 4), zero.dtype) + zero
 
-        return window, *lax.cond(jnp.any(here), picture, nothing)
+        return lax.cond(picture.wanted, wanted, nothing)
 
-    if sides(light) == 1:
-        window, face, texel = (part[None] for part in draw(jnp.zeros((), jnp.int32)))
-    else:
-        window, face, texel = lax.map(draw, jnp.arange(sides(light)))
-    return ShadowMap(view, window.T, face, texel)
-
-
-def _fitted(light: ShiningLight, view: LightView, seen: Seen, here: Array, size: int) -> Array:
-    """Scales and offsets that bring the points into the picture; the first centre is at 0.5."""
-    smallest = jnp.asarray(_SMALLEST, seen.x.dtype)
-    if is_parallel(light):
-        smallest = smallest / jnp.abs(view.depth)
-    scales, offsets = [], []
-    for column in (seen.x, seen.y):
-        low = jnp.min(jnp.where(here, column, jnp.inf))
-        high = jnp.max(jnp.where(here, column, -jnp.inf))
-        some = low <= high
-        low, high = jnp.where(some, low, -smallest), jnp.where(some, high, smallest)
-        span = jnp.maximum(high - low, smallest)
-        scale = (size - 2 * _BORDER) / span
-        scales.append(scale)
-        offsets.append(size / 2 - scale * (low + high) / 2)
-    return jnp.stack([*scales, *offsets])
+    if pictures.wanted.shape[0] > 1:
+        return lax.map(draw, pictures)
+    face, texel = draw(Picture(*(column[0] for column in pictures)))
+    return face[None], texel[None]
 
 
-def _texels(light: ShiningLight, view: LightView, key: Array, window: Array) -> Array:
+def _range(column: Array, some: Array) -> tuple[Array, Array]:
+    return jnp.min(jnp.where(some, column, jnp.inf)), jnp.max(jnp.where(some, column, -jnp.inf))
+
+
+def _texels(key: Float[Array, "size size"], limit: Float[Array, "2"]) -> Array:
     """Key, slopes and error at each texel; the error is infinite at the border."""
     size = key.shape[0]
     around = jnp.pad(key, 1, constant_values=-jnp.inf)
@@ -103,8 +120,6 @@ def _texels(light: ShiningLight, view: LightView, key: Array, window: Array) -> 
     error = jnp.zeros_like(key)
     for one, other in pairs:
         error = jnp.maximum(error, jnp.abs((one - key) + (other - key)))
-    width = 1 / jnp.minimum(window[0], window[1])
-    limit = _SMOOTH * width * (jnp.abs(view.depth) if is_parallel(light) else key)
-    smooth = (error <= limit) & jnp.isfinite(key)  # NaN where there is nothing
+    smooth = error <= limit[0] + limit[1] * key  # NaN, and not smooth, where there is nothing
     slopes = [jnp.where(smooth, (a - b) / 2, 0) for a, b in pairs[:2]]
     return assemble(stored([key, *slopes, jnp.where(smooth, error, jnp.inf)]))

@@ -102,5 +102,19 @@ def homogeneous(light: ShiningLight, view: LightView, side: Array, position: Col
     return [x, y, z, jnp.ones_like(z)]
 
 
+def matrices(light: ShiningLight, view: LightView) -> Float[Array, "sides 4 4"]:
+    """For each picture the matrix that takes (offset from the origin, 1) to x, y, w and k."""
+    dtype = view.axes.dtype
+    last = jnp.array([0, 0, 0, 1], dtype)
+    found = []
+    for side in range(sides(light)):
+        first = side // 2 + 1 if isinstance(light, PointLight) else 0
+        x, y, z = (jnp.append(view.axes[(first + k) % 3], 0) for k in range(3))
+        z = -z if side % 2 else z
+        rows = [x, y, last, view.depth * z] if is_parallel(light) else [x, y, z, last]
+        found.append(jnp.stack(rows))
+    return jnp.stack(found)
+
+
 def _of_axis(axis: Array, values: Columns) -> Array:
     return jnp.where(axis == 0, values[0], jnp.where(axis == 1, values[1], values[2]))
