@@ -27,24 +27,23 @@ class World(NamedTuple):
     scene: Scene
     camera: Camera
     geometry: Geometry
-    shadows: Shadows
+    shadows: Shadows | None
 
 
 def cast_shadows(
     scene: Scene, camera: Camera, geometry: Geometry, points: Points, shading: str
 ) -> tuple[World, Reached]:
     """The world with the shadows that fall on points, and which lights reach those."""
-    none = (None,) * len(scene.lights)
     if shading == "unlit" or not any(map(casts_shadow, scene.lights)):
-        return World(scene, camera, geometry, none), none
+        return World(scene, camera, geometry, None), (None,) * len(scene.lights)
     shadows, reached = cast(scene.lights, geometry, points)
     return World(scene, camera, geometry, shadows), reached
 
 
 def receive_shadows(world: World, points: Points) -> Reached:
     """Which lights reach points."""
-    if all(shadow is None for shadow in world.shadows):
-        return (None,) * len(world.shadows)
+    if world.shadows is None:
+        return (None,) * len(world.scene.lights)
     return receive(world.scene.lights, world.shadows, world.geometry, points)
 
 
@@ -64,7 +63,7 @@ def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
 
 def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     """Interpolate the colours of vertices; of each light with shadows apart, which are sharp."""
-    scene, camera, geometry, shadows = world
+    scene, camera, geometry, _ = world
     assert geometry.normals is not None
     vertices = jnp.arange(geometry.positions.shape[0])
     reflectance = _reflectance(scene, geometry.object_of_vertex, vertices)
@@ -79,8 +78,8 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
         return at_points(jnp.stack(color, axis=-1), geometry, points)
 
     everywhere, alone = [], []
-    for light, shadow in zip(scene.lights, shadows, strict=True):
-        if shadow is None or isinstance(light, AmbientLight):
+    for light, part in zip(scene.lights, reached, strict=True):
+        if part is None or isinstance(light, AmbientLight):
             everywhere.append(light)
             continue
         alone.append(without_ambient(light))

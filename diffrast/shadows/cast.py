@@ -1,27 +1,40 @@
 """The shadows of all lights of a scene."""
 
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from diffrast._stored import stored
 from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, ShiningLight, casts_shadow
 from diffrast.linalg import dot
-from diffrast.shadows.lit import lit
-from diffrast.shadows.maps import Picture, ShadowMap, plan, take
-from diffrast.shadows.views import LightView, Seen, is_parallel, light_view, see
+from diffrast.shadows.lit import Rays, lit
+from diffrast.shadows.maps import Pictures, Plan, plan, take
+from diffrast.shadows.views import LightView, Seen, is_parallel, light_view, see, sides
 
-T = TypeVar("T")
-Shadows: TypeAlias = tuple[ShadowMap | None, ...]  # one entry a light, None if it casts none
-Reached: TypeAlias = tuple[Array | None, ...]  # the same: 1 where it reaches a point, or 0
+Reached: TypeAlias = tuple[Array | None, ...]  # by each light: 1 at points it reaches, or 0
+
+
+class _Regard(NamedTuple):
+    """How one light sees points, and which of them are turned to it."""
+
+    seen: Seen
+    asked: Bool[Array, "*size"]
+
+
+class Shadows(NamedTuple):
+    """What all lights that cast shadows see."""
+
+    views: tuple[LightView, ...]
+    windows: tuple[Float[Array, "sides 4"], ...]
+    pictures: tuple[Pictures, ...]  # one for each resolution, in ascending order
 
 
 def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple[Shadows, Reached]:
-    """Draw what each light sees of the scene round the points, where it casts shadows.
+    """Take the pictures of the lights that cast shadows, fitted to points.
 
     Args:
         lights: of the scene.
@@ -32,28 +45,28 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
         The shadows, and what `receive` tells of these points.
     """
     lights, geometry, points = lax.stop_gradient((lights, geometry, points))
+    casting = [light for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
-        casting = [light for light in lights if casts_shadow(light)]
         views = [light_view(light, geometry.positions) for light in casting]
-        regards = [
-            _regard(light, view, geometry, points)
-            for light, view in zip(casting, views, strict=True)
-        ]
-        seen = [seen for seen, _ in regards]
-        wanted = [(points.face >= 0) & seen.inside & towards for seen, towards in regards]
-        maps = _draw(casting, views, seen, wanted, geometry)
-        bright = [
-            lit(light, shadow_map, geometry, points, seen, towards)
-            for light, shadow_map, (seen, towards) in zip(casting, maps, regards, strict=True)
-        ]
-    return _for_all(lights, maps), _for_all(lights, bright)
+        regards = _regards(casting, views, geometry, points)
+        windows, plans = zip(
+            *(
+                plan(light, view, seen, asked & (points.face >= 0))
+                for light, view, (seen, asked) in zip(casting, views, regards, strict=True)
+            ),
+            strict=True,
+        )
+        pictures = []
+        for size, members in _by_resolution(casting):
+            joined = zip(*(plans[i] for i in members), strict=True)
+            together = Plan(*(jnp.concatenate(column) for column in joined))
+            pictures.append(take(together, geometry, size))
+        shadows = Shadows(tuple(views), windows, tuple(pictures))
+        return shadows, _reached(lights, shadows, geometry, points, regards)
 
 
 def receive(
-    lights: tuple[Light, ...],
-    shadows: Shadows,
-    geometry: Geometry,
-    points: Points,
+    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, points: Points
 ) -> Reached:
     """1 where a light reaches points, 0 where it does not, None for a light without shadows.
 
@@ -62,55 +75,60 @@ def receive(
     """
     lights, geometry, points = lax.stop_gradient((lights, geometry, points))
     casting = [light for light in lights if casts_shadow(light)]
-    maps = [shadow_map for shadow_map in shadows if shadow_map is not None]
-    bright = []
     with jax.named_scope("shadow"):
-        for light, shadow_map in zip(casting, maps, strict=True):
-            seen, towards = _regard(light, shadow_map.view, geometry, points)
-            bright.append(lit(light, shadow_map, geometry, points, seen, towards))
-    return _for_all(lights, bright)
+        regards = _regards(casting, list(shadows.views), geometry, points)
+        return _reached(lights, shadows, geometry, points, regards)
 
 
-def _draw(
-    lights: list[ShiningLight],
-    views: list[LightView],
-    seen: list[Seen],
-    wanted: list[Array],
-    geometry: Geometry,
-) -> list[ShadowMap]:
-    """Draw the lights' pictures, all those of one size by one program."""
-    plans = [plan(*each) for each in zip(lights, views, seen, wanted, strict=True)]
-    maps: dict[int, ShadowMap] = {}
+def _by_resolution(lights: list[ShiningLight]) -> list[tuple[int, list[int]]]:
+    """Resolutions in ascending order, each with the numbers of its lights."""
     sizes = [light.shadow.resolution for light in lights if light.shadow is not None]
-    for size in sorted(set(sizes)):
-        members = [i for i, own in enumerate(sizes) if own == size]
-        joined = [jnp.concatenate(c) for c in zip(*(plans[i][1] for i in members), strict=True)]
-        face, texel = take(Picture(*joined), geometry, size)
-        first = 0
-        for i in members:
-            window = plans[i][0]
-            own = slice(first, first + window.shape[0])
-            maps[i] = ShadowMap(views[i], window, face[own], texel[own])
-            first += window.shape[0]
-    return [maps[i] for i in range(len(lights))]
+    return [(size, [i for i, s in enumerate(sizes) if s == size]) for size in sorted(set(sizes))]
 
 
-def _for_all(lights: tuple[Light, ...], values: list[T]) -> tuple[T | None, ...]:
-    """Values of the lights that cast shadows, and None for the others."""
-    rest = iter(values)
-    return tuple(next(rest) if casts_shadow(light) else None for light in lights)
+def _regards(
+    lights: list[ShiningLight], views: list[LightView], geometry: Geometry, points: Points
+) -> list[_Regard]:
+    position = at_points(geometry.positions, geometry, points)
+    visible = jnp.maximum(points.face, 0)
+    regards = []
+    for light, view in zip(lights, views, strict=True):
+        seen = stored(see(light, view, position))
+        turned = _turned_to(light, view, geometry)
+        regards.append(_Regard(seen, seen.inside & turned[visible]))
+    return regards
 
 
-def _regard(
-    light: ShiningLight,
-    view: LightView,
+def _reached(
+    lights: tuple[Light, ...],
+    shadows: Shadows,
     geometry: Geometry,
     points: Points,
-) -> tuple[Seen, Bool[Array, "*size"]]:
-    """Where the light sees points, and whether their faces turn to it."""
-    seen = see(light, view, at_points(geometry.positions, geometry, points))
-    towards = _turned_to(light, view, geometry)
-    return stored(seen), towards[jnp.maximum(points.face, 0)]
+    regards: list[_Regard],
+) -> Reached:
+    """Look at all points of all lights of one resolution at once."""
+    casting = [light for light in lights if casts_shadow(light)]
+    reached: dict[int, Array] = {}
+    face, shape = jnp.ravel(points.face), points.face.shape
+    barycentrics = jnp.stack([jnp.ravel(b) for b in points.barycentrics])
+    for pictures, (_, members) in zip(shadows.pictures, _by_resolution(casting), strict=True):
+        parts, first = [], 0
+        for i in members:
+            seen, asked = regards[i]
+            window = shadows.windows[i]
+            scale_x, scale_y, offset_x, offset_y = (
+                window[0] if sides(casting[i]) == 1 else window.T[:, seen.side]
+            )
+            x, y = stored((scale_x * seen.x + offset_x, scale_y * seen.y + offset_y))
+            columns = seen.side + first, x, y, seen.key, seen.unit, asked
+            parts.append(Rays(face, barycentrics, *map(jnp.ravel, columns)))
+            first += sides(casting[i])
+        together = zip(*parts, strict=True)
+        rays = Rays(*(jnp.concatenate(column, axis=-1) for column in together))
+        bright = lit(pictures, geometry, rays).reshape(len(members), *shape)
+        reached.update(zip(members, bright, strict=True))
+    numbers = iter(range(len(casting)))
+    return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)
 
 
 def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " F"]:

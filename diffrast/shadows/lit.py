@@ -16,144 +16,121 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
-from diffrast.geometry import Geometry, Points
-from diffrast.light import ShiningLight
+from diffrast.geometry import Geometry
 from diffrast.raster.fixed_point import CULLED, group_by_class
-from diffrast.shadows.maps import ShadowMap
-from diffrast.shadows.views import Seen, homogeneous, is_parallel
+from diffrast.shadows.maps import Pictures
 
 _AT_ONCE = 512
 _ROUNDINGS = 32
 _SMALL = 4.0  # square texels, twice the area of a face
 
 
-def lit(
-    light: ShiningLight,
-    shadow_map: ShadowMap,
-    geometry: Geometry,
-    points: Points,
-    seen: Seen,
-    towards: Bool[Array, "*size"],
-) -> Float[Array, "*size"]:
-    """1 at points that the light sees, 0 at others. Not differentiable: pass stopped gradients.
+class Rays(NamedTuple):
+    """Points on faces and the pictures that may show them; all of one shape (n,)."""
 
-    Args:
-        light: that casts shadows.
-        shadow_map: its pictures.
-        geometry: of the scene.
-        points: on faces, of any shape.
-        seen: where the light sees them.
-        towards: whether their faces turn to the light.
-    """
-    shape = towards.shape
-    seen = Seen(*(jnp.ravel(column) for column in seen))
-    asked = jnp.ravel(towards) & seen.inside
-    at = _texel_of(shadow_map, seen)
-    key, slope_x, slope_y, error = _at_texels(shadow_map.texel, at.number).T
-    depth = key + slope_x * at.x + slope_y * at.y
-    rounding = _ROUNDINGS * jnp.finfo(key.dtype).eps * jnp.ones_like(key)
-    if not is_parallel(light):
-        rounding = rounding * seen.key
-    bright = asked & (seen.key >= depth - error - rounding)
-    order, starts = group_by_class(jnp.where(asked & jnp.isinf(error), 0, CULLED))
-    face = jnp.ravel(points.face)
-    barycentrics = jnp.stack([jnp.ravel(b) for b in points.barycentrics])
-
-    def look_closer(n: Array, bright: Array) -> Array:
-        slots = n * _AT_ONCE + jnp.arange(_AT_ONCE)
-        chosen = order[jnp.minimum(slots, order.shape[0] - 1)]
-        some = Points(face[chosen], list(barycentrics[:, chosen]), key[chosen])
-        place = Place(*(column[chosen] for column in at))
-        free = ~_blocked(light, shadow_map, geometry, some, place, seen.key[chosen])
-        return bright.at[jnp.where(slots < starts[1], chosen, bright.size)].set(free, mode="drop")
-
-    chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
-    bright = lax.fori_loop(0, chunks, look_closer, bright).reshape(shape)
-    return bright.astype(key.dtype)
+    face: Int[Array, " n"]
+    barycentrics: Float[Array, "3 n"]
+    picture: Int[Array, " n"]
+    x: Float[Array, " n"]  # in texels
+    y: Float[Array, " n"]
+    key: Float[Array, " n"]
+    unit: Float[Array, " n"]  # of the key, for rounding errors
+    asked: Bool[Array, " n"]  # false where the light does not shine
 
 
-class Place(NamedTuple):
-    """A texel, and where points lie from its centre in texels."""
+class _Texel(NamedTuple):
+    """Texels, and where points lie from their centres."""
 
-    side: Int[Array, " n"]
     row: Int[Array, " n"]
     column: Int[Array, " n"]
-    number: Int[Array, " n"]
     x: Float[Array, " n"]
     y: Float[Array, " n"]
 
 
-def _texel_of(shadow_map: ShadowMap, seen: Seen) -> Place:
-    size = shadow_map.face.shape[1]
-    scale_x, scale_y, offset_x, offset_y = _windows(shadow_map, seen.side)
-    x, y = scale_x * seen.x + offset_x, scale_y * seen.y + offset_y
-    column, row = (jnp.clip(jnp.floor(at), 0, size - 1).astype(jnp.int32) for at in (x, y))
-    number = (seen.side * size + row) * size + column
-    return Place(seen.side, row, column, number, x - (column + 0.5), y - (row + 0.5))
+def lit(pictures: Pictures, geometry: Geometry, rays: Rays) -> Float[Array, " n"]:
+    """1 where a light sees points that are asked for, 0 elsewhere. Not differentiable."""
+    texel = _texel_of(pictures, rays)
+    key, slope_x, slope_y, error = _at_texels(pictures.texel, rays.picture, texel).T
+    depth = key + slope_x * texel.x + slope_y * texel.y
+    rounding = _ROUNDINGS * jnp.finfo(key.dtype).eps * rays.unit
+    bright = rays.asked & (rays.key >= depth - error - rounding)
+    order, starts = group_by_class(jnp.where(rays.asked & jnp.isinf(error), 0, CULLED))
+
+    def look_closer(n: Array, bright: Array) -> Array:
+        slots = n * _AT_ONCE + jnp.arange(_AT_ONCE)
+        chosen = order[jnp.minimum(slots, order.shape[0] - 1)]
+        some = stored(Rays(*(column[..., chosen] for column in rays)))
+        place = jnp.where(slots < starts[1], chosen, bright.size)
+        return bright.at[place].set(~_blocked(pictures, geometry, some), mode="drop")
+
+    chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
+    return lax.fori_loop(0, chunks, look_closer, bright).astype(key.dtype)
 
 
-def _windows(shadow_map: ShadowMap, side: Array) -> Array:
-    """The windows of each point's picture, four columns."""
-    window = shadow_map.window
-    return window[0] if window.shape[0] == 1 else window.T[:, side]
+def _texel_of(pictures: Pictures, rays: Rays) -> _Texel:
+    last = pictures.face.shape[1] - 1
+    column, row = (jnp.clip(jnp.floor(at), 0, last).astype(jnp.int32) for at in (rays.x, rays.y))
+    return _Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
 
 
-def _at_texels(values: Array, number: Array) -> Array:
-    """Rows of an array (sides, size, size, ...)."""
-    return values.reshape(-1, *values.shape[3:])[number]
+def _at_texels(values: Array, picture: Array, texel: _Texel) -> Array:
+    """Entries of an array (pictures, size, size, ...)."""
+    size = values.shape[1]
+    number = (picture * size + texel.row) * size + texel.column
+    return values.reshape(-1, *values.shape[3:])[stored(number)]
 
 
-def _blocked(
-    light: ShiningLight,
-    shadow_map: ShadowMap,
-    geometry: Geometry,
-    points: Points,
-    place: Place,
-    key: Array,
-) -> Bool[Array, " n"]:
+def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, " n"]:
     """Whether faces near the rays from points to the light stop them."""
-    size = shadow_map.face.shape[1]
+    texel = _texel_of(pictures, rays)
+    last = pictures.face.shape[1] - 1
     nine = jnp.arange(9)[:, None]
-    row = jnp.clip(place.row + nine // 3 - 1, 0, size - 1)
-    column = jnp.clip(place.column + nine % 3 - 1, 0, size - 1)
-    around = stored(shadow_map.face[place.side, row, column])
+    row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
+    column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
+    around = stored(pictures.face[rays.picture, row, column])
     table = geometry.positions.T
 
     def corners_of(face: Array) -> Array:
         """The corners' x, y and z, shape (3, 3 corners, *face)."""
         return stored(table[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
 
-    own, others = corners_of(points.face), corners_of(around)
+    own, others = corners_of(rays.face), corners_of(around)
     origin = own[:, 0]
-    total = points.barycentrics[0] + points.barycentrics[1] + points.barycentrics[2]
-    shares = [b / jnp.where(total == 0, 1, total) for b in points.barycentrics]
+    total = jnp.sum(rays.barycentrics, axis=0)
+    shares = rays.barycentrics / jnp.where(total == 0, 1, total)
     point = shares[1] * (own[:, 1] - origin) + shares[2] * (own[:, 2] - origin)
-    view = shadow_map.view
-    if is_parallel(light):
-        ray = jnp.broadcast_to(-view.axes[2][:, None], point.shape)
-    else:
-        ray = (view.origin[:, None] - origin) - point
+    source = pictures.plan.source[rays.picture].T
+    ray = (source[:3] - source[3] * origin) - source[3] * point
     ray, corners = stored((ray, (others - origin[:, None, None]) - point[:, None, None]))
-    stops = _stops(corners, ray[:, None], endless=is_parallel(light))
-    foreign = (around >= 0) & (around != points.face)
+    stops = _stops(corners, ray[:, None], endless=source[3] == 0)
+    foreign = (around >= 0) & (around != rays.face)
     found = jnp.max(jnp.where(foreign, stops, -1), axis=0) > 0
-    # Faces too small to be found.
-    nearest = around[4]
-    slopes, small = _slopes(light, shadow_map, place, others[:, :, 4])
-    own_slopes, _ = _slopes(light, shadow_map, place, own)
-    beyond = _at_texels(shadow_map.texel, place.number)[:, 0] - key
-    beyond = beyond + own_slopes[0] * place.x + own_slopes[1] * place.y
-    margin = sum(
-        jnp.abs((a - b) * at)
-        for a, b, at in zip(slopes, own_slopes, (place.x, place.y), strict=True)
-    )
-    margin = margin + _ROUNDINGS * jnp.finfo(key.dtype).eps * jnp.abs(key)
-    own_seen = jnp.any(around == points.face, axis=0)
-    hidden = (nearest >= 0) & (nearest != points.face) & (beyond > margin)
-    return found | (hidden & (small | ~own_seen))
+    return found | _hidden_by_small(pictures, rays, texel, around, own, others[:, :, 4])
 
 
-def _stops(corners: Array, ray: Array, *, endless: bool) -> Array:
+def _hidden_by_small(
+    pictures: Pictures, rays: Rays, texel: _Texel, around: Array, own: Array, nearest: Array
+) -> Bool[Array, " n"]:
+    """Whether points lie behind the nearest texel, of faces too small for a texel each.
+
+    What is compared are the planes of the point's own face and of the nearest texel's, with a
+    margin for surfaces that curve from one to the other.
+    """
+    own_slopes, _ = _slopes(pictures, rays, own)
+    slopes, area = _slopes(pictures, rays, nearest)
+    at = texel.x, texel.y
+    behind = _at_texels(pictures.texel, rays.picture, texel)[:, 0] - rays.key
+    behind = behind + own_slopes[0] * at[0] + own_slopes[1] * at[1]
+    margin = jnp.abs((slopes[0] - own_slopes[0]) * at[0])
+    margin = margin + jnp.abs((slopes[1] - own_slopes[1]) * at[1])
+    margin = margin + _ROUNDINGS * jnp.finfo(margin.dtype).eps * rays.unit
+    face = around[4]
+    shown = jnp.any(around == rays.face, axis=0)
+    hidden = (face >= 0) & (face != rays.face) & (behind > margin)
+    return hidden & ((area < _SMALL) | ~shown)
+
+
+def _stops(corners: Array, ray: Array, *, endless: Array) -> Array:
     """Positive where faces, given from the beginning of rays, stop them before their end."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = _cross(b - a, c - a)
@@ -165,20 +142,21 @@ def _stops(corners: Array, ray: Array, *, endless: bool) -> Array:
     rounding = _dot(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
     rounding = rounding * (_ROUNDINGS * jnp.finfo(corners.dtype).eps)
     before = sign * distance
-    if not endless:
-        before = jnp.minimum(before, sign * along - before)
+    before = jnp.where(endless, before, jnp.minimum(before, sign * along - before))
     return stored(jnp.where(inside, before - rounding, -1))
 
 
-def _slopes(
-    light: ShiningLight, shadow_map: ShadowMap, place: Place, corners: Array
-) -> tuple[list[Array], Array]:
-    """How the depth key changes from texel to texel on faces, and whether they are small."""
-    x, y, w, k = homogeneous(light, shadow_map.view, place.side, list(corners))
-    scale_x, scale_y, offset_x, offset_y = _windows(shadow_map, place.side)
-    at_x, at_y = place.column + 0.5 + place.x, place.row + 0.5 + place.y
-    x = scale_x * x + (offset_x - at_x) * w
-    y = scale_y * y + (offset_y - at_y) * w
+def _slopes(pictures: Pictures, rays: Rays, corners: Array) -> tuple[list[Array], Array]:
+    """How the depth key changes from texel to texel on faces, and twice their area in texels.
+
+    The area is infinite where a face reaches behind the light.
+    """
+    matrix = jnp.moveaxis(pictures.plan.matrix[rays.picture], 0, 2)  # (4, 4, n)
+    offset = corners - pictures.plan.origin[rays.picture].T[:, None]
+    x, y, w, k = (
+        row[0] * offset[0] + row[1] * offset[1] + row[2] * offset[2] + row[3] for row in matrix
+    )
+    x, y = x - rays.x * w, y - rays.y * w
     rows = jnp.stack([x, y, w, k])
     first, one, other = rows[:, 0], rows[:, 1] - rows[:, 0], rows[:, 2] - rows[:, 0]
 
@@ -190,11 +168,9 @@ def _slopes(
     inverse = jnp.where(volume == 0, 0, 1) / jnp.where(volume == 0, 1, volume)
     slopes = [determinant(3, 1, 2) * inverse, determinant(0, 3, 2) * inverse]
     before = jnp.all(w > 0, axis=0)
-    flat_x, flat_y = (column / jnp.where(before, w, 1) for column in (x, y))
-    twice = (flat_x[1] - flat_x[0]) * (flat_y[2] - flat_y[0]) - (flat_x[2] - flat_x[0]) * (
-        flat_y[1] - flat_y[0]
-    )
-    return slopes, before & (jnp.abs(twice) < _SMALL)
+    x, y = (column / jnp.where(before, w, 1) for column in (x, y))
+    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+    return slopes, jnp.where(before, jnp.abs(area), jnp.inf)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -13,40 +13,44 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import assemble, stored, stored_rows
+from diffrast._stored import assemble, stored
 from diffrast.geometry import Geometry
 from diffrast.light import ShiningLight
 from diffrast.linalg import apply_matrix
 from diffrast.raster.coverage import faces_and_depths
-from diffrast.shadows.views import LightView, Seen, is_parallel, matrices, sides
+from diffrast.shadows.views import LightView, Seen, is_parallel, matrices, sides, source
 
 _BORDER = 2.0  # texels round what is seen
 _SMALLEST = 1e-5  # side of a window, in units of the depth range or of a right angle's tangent
 _SMOOTH = 0.5  # texels
 
 
-class ShadowMap(NamedTuple):
-    """What a light sees."""
+class Plan(NamedTuple):
+    """Pictures to be taken, of one light or of several, one after another."""
 
-    view: LightView
-    window: Float[Array, "sides 4"]  # scale of x and y to texels, and their offsets
-    face: Int[Array, "sides size size"]
-    texel: Float[Array, "sides size size 4"]  # key, its slopes along columns and rows, their error
+    source: Float[Array, "n 4"]  # the light as a homogeneous point
+    origin: Float[Array, "n 3"]
+    matrix: Float[Array, "n 4 4"]  # from (offset from the origin, 1) to x, y in texels, w and k
+    depth: Float[Array, "n"]  # clip z of k = 1
+    limit: Float[Array, "n 2"]  # of a smooth surface's second differences: a + b key
+    wanted: Bool[Array, "n"]
 
 
-class Picture(NamedTuple):
-    """One picture to be taken, or several along the first axis."""
+class Pictures(NamedTuple):
+    """What lights see."""
 
-    origin: Float[Array, "*n 3"]
-    clip: Float[Array, "*n 4 4"]  # from (offset from the origin, 1)
-    limit: Float[Array, "*n 2"]  # of a smooth surface's second differences: a + b key
-    wanted: Bool[Array, "*n"]
+    plan: Plan
+    face: Int[Array, "n size size"]
+    texel: Float[Array, "n size size 4"]  # key, its slopes along columns and rows, their error
 
 
 def plan(
     light: ShiningLight, view: LightView, seen: Seen, wanted: Bool[Array, "*size"]
-) -> tuple[Float[Array, "sides 4"], Picture]:
-    """Fit the light's pictures to the wanted points: their windows, and how to take them."""
+) -> tuple[Float[Array, "sides 4"], Plan]:
+    """Fit the light's pictures to the wanted points: their windows, and how to take them.
+
+    A window is the scale of x and y to texels, and the offsets.
+    """
     assert light.shadow is not None
     size, count = light.shadow.resolution, sides(light)
     here = [wanted & (seen.side == side) if count > 1 else wanted for side in range(count)]
@@ -59,48 +63,43 @@ def plan(
     offset = size / 2 - scale * (low + high) / 2
 
     x, y, w, k = jnp.moveaxis(matrices(light, view), 1, 0)
-    half = size / 2
-    rows = [
-        (scale[:, :1] * x + offset[:, :1] * w) / half - w,
-        w - (scale[:, 1:] * y + offset[:, 1:] * w) / half,
-        -k if is_parallel(light) else jnp.zeros_like(k),
-        w,
-    ]
+    x, y = (scale[:, i, None] * axis + offset[:, i, None] * w for i, axis in enumerate((x, y)))
     width = _SMOOTH / jnp.min(scale, axis=1)
-    zero = jnp.zeros_like(width)
-    limit = (width * jnp.abs(view.depth), zero) if is_parallel(light) else (zero, width)
-    picture = Picture(
-        jnp.broadcast_to(view.origin, (count, 3)),
-        jnp.stack(rows, axis=1),
-        jnp.stack(limit, axis=1),
-        some,
+    none = jnp.zeros_like(width)
+    parallel = is_parallel(light)
+    return jnp.concatenate([scale, offset], axis=1), Plan(
+        source=jnp.broadcast_to(source(light, view), (count, 4)),
+        origin=jnp.broadcast_to(view.origin, (count, 3)),
+        matrix=jnp.stack([x, y, w, k], axis=1),
+        depth=jnp.full_like(width, -1 if parallel else 0),
+        limit=jnp.stack((width * jnp.abs(view.depth), none) if parallel else (none, width), axis=1),
+        wanted=some,
     )
-    return jnp.concatenate([scale, offset], axis=1), picture
 
 
-def take(
-    pictures: Picture, geometry: Geometry, size: int
-) -> tuple[Int[Array, "n size size"], Float[Array, "n size size 4"]]:
-    """Faces and texels of pictures, one after another; of unwanted ones nothing."""
+def take(plans: Plan, geometry: Geometry, size: int) -> Pictures:
+    """Take pictures, one after another; unwanted ones stay empty."""
 
-    def draw(picture: Picture) -> tuple[Array, Array]:
+    def draw(plan: Plan) -> tuple[Array, Array]:
         def wanted() -> tuple[Array, Array]:
-            offset = geometry.positions - picture.origin
-            clip = stored_rows(apply_matrix(picture.clip[:, :3], offset) + picture.clip[:, 3])
+            offset = geometry.positions - plan.origin
+            x, y, w, k = (apply_matrix(plan.matrix[:, :3], offset) + plan.matrix[:, 3]).T
+            half = size / 2
+            clip = assemble(stored([x / half - w, w - y / half, plan.depth * k, w]))
             face, key = faces_and_depths(clip, geometry.faces, size=size)
-            return face, _texels(key, picture.limit)
+            return face, _texels(key, plan.limit)
 
         def nothing() -> tuple[Array, Array]:
-            zero = picture.origin[0] * 0  # varies as the data do
+            zero = plan.depth * 0  # varies as the data do
             face = jnp.full((size, size), -1, jnp.int32) + zero.astype(jnp.int32)
             return face, jnp.zeros((size, size, 4), zero.dtype) + zero
 
-        return lax.cond(picture.wanted, wanted, nothing)
+        return lax.cond(plan.wanted, wanted, nothing)
 
-    if pictures.wanted.shape[0] > 1:
-        return lax.map(draw, pictures)
-    face, texel = draw(Picture(*(column[0] for column in pictures)))
-    return face[None], texel[None]
+    if plans.wanted.shape[0] > 1:
+        return Pictures(plans, *lax.map(draw, plans))
+    face, texel = draw(Plan(*(column[0] for column in plans)))
+    return Pictures(plans, face[None], texel[None])
 
 
 def _range(column: Array, some: Array) -> tuple[Array, Array]:

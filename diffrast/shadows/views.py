@@ -34,10 +34,11 @@ class LightView(NamedTuple):
 class Seen(NamedTuple):
     """Points as a light sees them."""
 
-    side: Int[Array, "*size"]  # which picture shows them
+    side: Int[Array, "*size"]  # which of its pictures shows them
     x: Float[Array, "*size"]  # x/w and y/w: where
     y: Float[Array, "*size"]
     key: Float[Array, "*size"]
+    unit: Float[Array, "*size"]  # of the key, for rounding errors
     inside: Bool[Array, "*size"]  # whether the light shines there at all
 
 
@@ -77,29 +78,26 @@ def see(light: ShiningLight, view: LightView, position: Columns) -> Seen:
         first = (size[0] >= size[1]) & (size[0] >= size[2])
         axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
         side = 2 * axis + (_of_axis(axis, offset) < 0)
-    x, y, w, key = homogeneous(light, view, side, position)
+        across = [_of_axis(axis, [*offset[k:], *offset[:k]]) for k in (1, 2)]
+        x, y, z = *across, jnp.abs(_of_axis(axis, offset))
+    else:
+        x, y, z = (sum(row[i] * offset[i] for i in range(3)) for row in view.axes)
     if is_parallel(light):
-        return Seen(side, x, y, key, jnp.ones(x.shape, bool))
-    inside = w > 0
-    inverse = 1 / jnp.where(inside, w, 1)
+        return Seen(side, x, y, view.depth * z, jnp.ones_like(z), jnp.ones(z.shape, bool))
+    inside = z > 0
+    inverse = 1 / jnp.where(inside, z, 1)
     x, y = x * inverse, y * inverse
     if isinstance(light, SpotLight):
         reach = jnp.tan(light.cutoff)
         inside = inside & (x * x + y * y < reach * reach)
-    return Seen(side, x, y, inverse, inside)
+    return Seen(side, x, y, inverse, inverse, inside)
 
 
-def homogeneous(light: ShiningLight, view: LightView, side: Array, position: Columns) -> Columns:
-    """Columns x, y, w and k of positions, each as one of the light's pictures shows it."""
-    offset = [position[i] - view.origin[i] for i in range(3)]
-    if isinstance(light, PointLight):
-        x, y, z = (_of_axis(side // 2, [*offset[k:], *offset[:k]]) for k in (1, 2, 0))
-        z = jnp.where(side % 2 == 0, z, -z)
-    else:
-        x, y, z = (sum(row[i] * offset[i] for i in range(3)) for row in view.axes)
+def source(light: ShiningLight, view: LightView) -> Float[Array, "4"]:
+    """The light as a homogeneous point; from p it lies in the direction of x, y, z - w p."""
     if is_parallel(light):
-        return [x, y, jnp.ones_like(z), view.depth * z]
-    return [x, y, z, jnp.ones_like(z)]
+        return jnp.append(-view.axes[2], 0)
+    return jnp.append(view.origin, 1)
 
 
 def matrices(light: ShiningLight, view: LightView) -> Float[Array, "sides 4 4"]:
