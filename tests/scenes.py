@@ -188,7 +188,8 @@ class Oracle:
             if isinstance(light, dr.AmbientLight):
                 lights.append({"type": "ambient", "ambient": np.asarray(light.color, float)})
                 continue
-            values = {k: np.asarray(v, float) for k, v in vars(light).items() if v is not None}
+            given = {k: v for k, v in vars(light).items() if v is not None and k != "shadow"}
+            values = {k: np.asarray(v, float) for k, v in given.items()}
             lights.append({"type": kinds[type(light)], **values})
         return lights
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 import reference
@@ -421,14 +420,6 @@ def test_other_values_are_not_compiled_again():
 
 
 # --------------------------------------------------------------------------------------- bad input
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """The library's own errors, not those of the annotations that the tests check."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 MESH = shapes.cube
