@@ -19,7 +19,7 @@ Reached: TypeAlias = tuple[Array | None, ...]  # by each light: 1 at points it r
 
 
 class _Regard(NamedTuple):
-    """How one light sees points, and which of them are turned to it."""
+    """How one light sees points, and which of them it shines on if nothing is between."""
 
     seen: Seen
     asked: Bool[Array, "*size"]
@@ -51,7 +51,7 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
         regards = _regards(casting, views, geometry, points)
         windows, plans = zip(
             *(
-                plan(light, view, seen, asked & (points.face >= 0))
+                plan(light, view, seen, asked)
                 for light, view, (seen, asked) in zip(casting, views, regards, strict=True)
             ),
             strict=True,
@@ -95,7 +95,7 @@ def _regards(
     for light, view in zip(lights, views, strict=True):
         seen = stored(see(light, view, position))
         turned = _turned_to(light, view, geometry)
-        regards.append(_Regard(seen, seen.inside & turned[visible]))
+        regards.append(_Regard(seen, seen.inside & turned[visible] & (points.face >= 0)))
     return regards
 
 
