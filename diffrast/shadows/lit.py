@@ -2,11 +2,10 @@
 
 Most points are told by one texel of the light's picture (see `maps`). The others, at the outlines
 of shadows and where the picture is too coarse for the surface, are collected and looked at one by
-one: the faces at the 3×3 texels round such a point are cut with its ray to the light. That needs no
-tolerance but for rounding, since everything is taken relative to a corner of the point's own face,
-and gives shadows straight and exact edges at any resolution.
-
-A face that turns away from the light is dark, as it is on any closed body.
+one: the faces at the 3×3 texels round such a point are cut with its ray to the light, everything
+relative to a corner of the point's own face, so that no bias is needed but for rounding. Outlines
+of faces larger than a texel are exact at any resolution; those of smaller ones, which none of the
+nine texels may show, are good to half a texel.
 """
 
 from typing import NamedTuple
