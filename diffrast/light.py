@@ -5,14 +5,16 @@ does not have (`None`) adds no operation: a light without `ambient` adds no ambi
 `AmbientLight` costs one addition.
 """
 
-from typing import TypeAlias
+import copy
+import math
+from typing import TypeAlias, TypeGuard
 
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array
-from diffrast._pytree import pytree_dataclass, set_field
+from diffrast._check import ArrayInput, float_array, positive_int, real_number
+from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.linalg import normalize
 
 Columns: TypeAlias = list[Array]  # x, y, z (or r, g, b), each of any one shape
@@ -29,6 +31,28 @@ class AmbientLight:
 
 
 @pytree_dataclass
+class Shadow:
+    """That a light casts shadows: what it cannot see gets its ambient part only (FEATURES S5).
+
+    Attributes:
+        resolution: rows and columns of the picture that the light takes of the scene, static. It is
+            fitted to what the camera sees. Outlines of faces that several of its pixels show are
+            exact whatever the resolution; what falls between its pixels casts no shadow.
+
+    Raises:
+        ValueError: for anything but an integer from 8 to 8192.
+    """
+
+    resolution: int = static(default=512)
+
+    def __post_init__(self) -> None:
+        resolution = positive_int("resolution", self.resolution, minimum=8)
+        if resolution > 8192:
+            raise ValueError(f"resolution: wanted at most 8192, got {resolution}")
+        set_field(self, "resolution", resolution)
+
+
+@pytree_dataclass
 class DirectionalLight:
     """Light from infinitely far away.
 
@@ -37,6 +61,7 @@ class DirectionalLight:
         diffuse: (3,) linear RGB.
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None.
+        shadow: how it casts shadows, or None for none.
 
     Raises:
         ValueError: for wrong shapes and numbers that are not finite.
@@ -46,6 +71,7 @@ class DirectionalLight:
     diffuse: Float[Array, "3"]
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
+    shadow: Shadow | None
 
     def __init__(
         self,
@@ -54,9 +80,11 @@ class DirectionalLight:
         ambient: ArrayInput | None = None,
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
+        shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "direction", float_array("direction", direction, (3,)))
         _set_colors(self, ambient, diffuse, specular)
+        _set_shadow(self, shadow)
 
 
 @pytree_dataclass
@@ -70,6 +98,7 @@ class PointLight:
         ambient: (3,) or None.
         attenuation: (3,) a, b, c: diffuse and specular light is divided by a + b r + c r² at the
             distance r; None for no attenuation.
+        shadow: how it casts shadows, or None for none.
 
     Raises:
         ValueError: for wrong shapes and numbers that are not finite.
@@ -80,6 +109,7 @@ class PointLight:
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
     attenuation: Float[Array, "3"] | None
+    shadow: Shadow | None
 
     def __init__(
         self,
@@ -89,19 +119,71 @@ class PointLight:
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
         attenuation: ArrayInput | None = None,
+        shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "position", float_array("position", position, (3,)))
         _set_colors(self, ambient, diffuse, specular)
-        if attenuation is not None:
-            attenuation = float_array("attenuation", attenuation, (3,))
-        set_field(self, "attenuation", attenuation)
+        _set_shadow(self, shadow)
+        _set_attenuation(self, attenuation)
 
 
-Light: TypeAlias = AmbientLight | DirectionalLight | PointLight
+@pytree_dataclass
+class SpotLight:
+    """Light from a point into a cone round an axis (FEATURES S2).
+
+    At the angle a from the axis diffuse and specular light is 1 - (1 - cos a) / (1 - cos cutoff) of
+    that on the axis, which is zero at the cutoff and stays zero beyond it.
+
+    Attributes:
+        position: (3,) in the world; differentiable.
+        direction: (3,) the way the light travels along the axis, of any length but zero;
+            differentiable.
+        cutoff: angle between the axis and the cone in radians, 0 < cutoff < pi / 2; differentiable.
+        diffuse: (3,) linear RGB, on the axis.
+        specular: (3,), equal to `diffuse` unless given.
+        ambient: (3,) or None; inside and outside of the cone alike.
+        attenuation: (3,) or None, as a `PointLight`'s.
+        shadow: how it casts shadows, or None for none.
+
+    Raises:
+        ValueError: for wrong shapes, numbers that are not finite, and a cutoff out of range.
+    """
+
+    position: Float[Array, "3"]
+    direction: Float[Array, "3"]
+    cutoff: Float[Array, ""]
+    diffuse: Float[Array, "3"]
+    specular: Float[Array, "3"]
+    ambient: Float[Array, "3"] | None
+    attenuation: Float[Array, "3"] | None
+    shadow: Shadow | None
+
+    def __init__(
+        self,
+        *,
+        position: ArrayInput,
+        direction: ArrayInput,
+        cutoff: ArrayInput,
+        ambient: ArrayInput | None = None,
+        diffuse: ArrayInput = (1.0, 1.0, 1.0),
+        specular: ArrayInput | None = None,
+        attenuation: ArrayInput | None = None,
+        shadow: Shadow | None = None,
+    ) -> None:
+        set_field(self, "position", float_array("position", position, (3,)))
+        set_field(self, "direction", float_array("direction", direction, (3,)))
+        set_field(self, "cutoff", real_number("cutoff", cutoff, above=0.0, below=math.pi / 2))
+        _set_colors(self, ambient, diffuse, specular)
+        _set_shadow(self, shadow)
+        _set_attenuation(self, attenuation)
+
+
+ShiningLight: TypeAlias = DirectionalLight | PointLight | SpotLight
+Light: TypeAlias = AmbientLight | ShiningLight
 
 
 def _set_colors(
-    light: DirectionalLight | PointLight,
+    light: ShiningLight,
     ambient: ArrayInput | None,
     diffuse: ArrayInput,
     specular: ArrayInput | None,
@@ -115,6 +197,18 @@ def _set_colors(
     set_field(light, "specular", float_array("specular", specular, (3,)))
 
 
+def _set_attenuation(light: PointLight | SpotLight, attenuation: ArrayInput | None) -> None:
+    if attenuation is not None:
+        attenuation = float_array("attenuation", attenuation, (3,))
+    set_field(light, "attenuation", attenuation)
+
+
+def _set_shadow(light: ShiningLight, shadow: Shadow | None) -> None:
+    if shadow is not None and not isinstance(shadow, Shadow):
+        raise ValueError(f"shadow: wanted a Shadow or None, got {type(shadow).__name__}")
+    set_field(light, "shadow", shadow)
+
+
 def total_ambient(lights: tuple[Light, ...]) -> Float[Array, "3"] | None:
     """Sum of the lights' ambient colours; None if no light has one."""
     colors = [light.color if isinstance(light, AmbientLight) else light.ambient for light in lights]
@@ -122,14 +216,24 @@ def total_ambient(lights: tuple[Light, ...]) -> Float[Array, "3"] | None:
     return sum(present[1:], start=present[0]) if present else None
 
 
+def without_ambient(light: ShiningLight) -> ShiningLight:
+    """The light without its ambient part."""
+    other = copy.copy(light)
+    set_field(other, "ambient", None)
+    return other
+
+
+def casts_shadow(light: Light) -> TypeGuard[ShiningLight]:
+    """Whether the light casts shadows."""
+    return not isinstance(light, AmbientLight) and light.shadow is not None
+
+
 def needs_position(light: Light) -> bool:
     """Whether the light at a point depends on where the point is."""
-    return isinstance(light, PointLight)
+    return isinstance(light, PointLight | SpotLight)
 
 
-def incoming(
-    light: DirectionalLight | PointLight, position: Columns | None
-) -> tuple[Columns, Array | None]:
+def incoming(light: ShiningLight, position: Columns | None) -> tuple[Columns, Array | None]:
     """Unit direction to the light, and the factor on its colours (None for one).
 
     Args:
@@ -142,11 +246,31 @@ def incoming(
     assert position is not None
     offset = [light.position[i] - position[i] for i in range(3)]
     direction, distance = normalize_columns(offset)
-    if light.attenuation is None:
-        return direction, None
-    a, b, c = (light.attenuation[i] for i in range(3))
+    factor = None if light.attenuation is None else _attenuated(light.attenuation, distance)
+    if isinstance(light, SpotLight):
+        fade = _fade(light, direction)
+        factor = fade if factor is None else fade * factor
+    return direction, factor
+
+
+def _attenuated(attenuation: Array, distance: Array) -> Array:
+    a, b, c = (attenuation[i] for i in range(3))
     divisor = a + distance * (b + distance * c)
-    return direction, jnp.where(divisor > 0, 1, 0) / jnp.where(divisor > 0, divisor, 1)
+    return jnp.where(divisor > 0, 1, 0) / jnp.where(divisor > 0, divisor, 1)
+
+
+def _fade(light: SpotLight, to_light: Columns) -> Array:
+    """Part of the light on the axis that goes in a direction.
+
+    1 - cos a is half the square of the distance between the two unit vectors, which keeps its
+    relative precision, and its derivative, at the axis.
+    """
+    axis = normalize(light.direction)
+    across = [axis[i] + to_light[i] for i in range(3)]
+    twice_versine = across[0] * across[0] + across[1] * across[1] + across[2] * across[2]
+    half = 2 * jnp.sin(light.cutoff / 2)
+    inverse = jnp.where(half == 0, 0, 1) / jnp.where(half == 0, 1, half * half)
+    return jnp.where(half == 0, 0, jnp.maximum(1 - twice_versine * inverse, 0))
 
 
 def normalize_columns(vector: Columns) -> tuple[Columns, Array]:

@@ -6,6 +6,7 @@ as columns, one array a component, which XLA fuses into one pass where stacked v
 compute their parts again for every component.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -46,11 +47,22 @@ def needs(lights: tuple[Light, ...], specular: bool) -> tuple[bool, bool]:
     return to_viewer or any(needs_position(light) for light in lights), to_viewer
 
 
-def phong(surface: Surface, reflectance: Reflectance, lights: tuple[Light, ...]) -> Columns:
+def phong(
+    surface: Surface,
+    reflectance: Reflectance,
+    lights: tuple[Light, ...],
+    reached: Sequence[Array | None] | None = None,
+) -> Columns:
     """Reflected light, linear RGB, not clamped. Differentiable in everything.
 
     A surface that faces away from a light gets its ambient part only. Normals are used as they
     are: they are not turned towards the viewer.
+
+    Args:
+        surface: where light is reflected.
+        reflectance: of the material there.
+        lights: any.
+        reached: for each light the part of it that arrives, None for all of it.
     """
     ambient = total_ambient(lights)
     zero = jnp.zeros_like(surface.normal[0])
@@ -58,12 +70,15 @@ def phong(surface: Surface, reflectance: Reflectance, lights: tuple[Light, ...])
         color = [zero, zero, zero]
     else:
         color = [reflectance.ambient[c] * ambient[c] + zero for c in range(3)]
-    shining = [light for light in lights if not isinstance(light, AmbientLight)]
-    if not shining:
+    if all(isinstance(light, AmbientLight) for light in lights):
         return color
     normal, _ = normalize_columns(surface.normal)
-    for light in shining:
+    for light, part in zip(lights, reached or [None] * len(lights), strict=True):
+        if isinstance(light, AmbientLight):
+            continue
         direction, factor = incoming(light, surface.position)
+        if part is not None:
+            factor = part if factor is None else part * factor
         cosine = _dot(normal, direction)
         diffuse = jnp.maximum(cosine, 0)
         if factor is not None:

@@ -1,6 +1,8 @@
 """Annotations of the library are checked at every call; plots need no display."""
 
+import jaxtyping
 import matplotlib
+import pytest
 from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
 
@@ -9,3 +11,11 @@ check_annotations = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 install_import_hook("diffrast", f"{__name__}.check_annotations")
 matplotlib.use("Agg")
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """The library's own errors, not those of the annotations that the tests check."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

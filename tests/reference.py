@@ -302,8 +302,9 @@ def render_phong(
     Args:
         positions_world, normals: (V, 3). faces: (F, 3).
         view, projection: 4x4, world to eye and eye to clip space.
-        lights: dicts with "type" "ambient", "directional" ("direction" of travel) or "point"
-            ("position"), and RGB "ambient", "diffuse", "specular", each zero unless given.
+        lights: dicts with "type" "ambient", "directional" ("direction" of travel), "point"
+            ("position") or "spot" ("position", "direction", "cutoff"), and RGB "ambient",
+            "diffuse", "specular", each zero unless given.
         material: dict of RGB "ambient", "diffuse", "specular" and "shininess". Each value may
             also be an array of one entry a face.
         background: RGB.
@@ -365,6 +366,10 @@ def shade(points, normals, to_viewer, lights, material, specular="phong") -> np.
         if light["type"] == "ambient":
             continue
         to_light = _towards_light(light, points)
+        if light["type"] == "spot":
+            fade = spot_fade(light, to_light)[:, None]
+            strength["diffuse"] = strength["diffuse"] * fade
+            strength["specular"] = strength["specular"] * fade
         cosine = np.sum(normals * to_light, axis=-1, keepdims=True)
         if specular == "phong":
             reflected = 2 * cosine * normals - to_light
@@ -382,6 +387,59 @@ def _towards_light(light, points) -> np.ndarray:
     if light["type"] == "directional":
         return np.broadcast_to(-normalize(np.asarray(light["direction"], float)), points.shape)
     return normalize(np.asarray(light["position"], float) - points)
+
+
+def spot_fade(light, to_light) -> np.ndarray:
+    """1 - (1 - cos a) / (1 - cos cutoff) inside the cone of a spot light, 0 outside."""
+    cosine = -to_light @ normalize(np.asarray(light["direction"], float))
+    return np.maximum(1 - (1 - cosine) / (1 - np.cos(float(light["cutoff"]))), 0)
+
+
+def lit(light, points, face, normals, positions, faces) -> np.ndarray:
+    """Which points a light reaches, by casting a ray from each against every face.
+
+    A face that turns away from the light, on the side that the shading's normals point to, is dark.
+
+    Args:
+        light: a dict as of `render_phong`, not an ambient one.
+        points: (N, 3), on the faces (N,), with normals (N, 3).
+        positions, faces: (V, 3), (F, 3) of everything that casts shadows.
+    """
+    positions, parallel = np.asarray(positions, float), light["type"] == "directional"
+    corners = positions[np.asarray(faces)]
+    plane = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if parallel:
+        ray = np.broadcast_to(-np.asarray(light["direction"], float), points.shape)
+        across = np.linalg.svd(ray[:1])[2][1:]  # two directions perpendicular to the light's
+
+        def seen(p) -> np.ndarray:  # homogeneous coordinates in the light's picture
+            return np.concatenate([p @ across.T, np.ones((*p.shape[:-1], 1))], axis=-1)
+
+    else:
+        position = np.asarray(light["position"], float)
+        ray = position - points
+
+        def seen(p) -> np.ndarray:
+            return p - position
+
+    vectors = seen(corners)
+    edges = np.cross(vectors[:, [1, 2, 0]], vectors[:, [2, 0, 1]])
+    turned = np.sum(plane[face] * ray, axis=1) * np.sum(plane[face] * normals, axis=1)
+    free = turned > 0
+    if light["type"] == "spot":
+        free &= spot_fade(light, normalize(ray)) > 0
+    size = np.abs(positions - positions.mean(axis=0)).max()
+    for some in np.array_split(np.flatnonzero(free), max(1, np.sum(free) * len(faces) // 2**23)):
+        first, second, third = (seen(points[some]) @ edges[:, k].T >= 0 for k in range(3))
+        of, by = np.nonzero((first == second) & (second == third))
+        point, to_light = points[some[of]], ray[some[of]]
+        along = np.sum(plane[by] * to_light, axis=1)
+        with np.errstate(all="ignore"):
+            at = np.sum(plane[by] * (corners[by, 0] - point), axis=1) / along
+        least = 1e-9 * size / np.linalg.norm(to_light, axis=1)
+        stopped = (at > least) & (at < (np.inf if parallel else 1 - 1e-9)) & (by != face[some[of]])
+        free[some[of[stopped]]] = False
+    return free
 
 
 def _at_faces(material, face) -> dict[str, np.ndarray]:

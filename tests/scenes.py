@@ -178,13 +178,18 @@ class Oracle:
         return {k: np.asarray(values, float)[self.object_of_face] for k, values in table.items()}
 
     def _lights(self):
-        kinds = {dr.DirectionalLight: "directional", dr.PointLight: "point"}
+        kinds = {
+            dr.DirectionalLight: "directional",
+            dr.PointLight: "point",
+            dr.SpotLight: "spot",
+        }
         lights = []
         for light in self.scene.lights:
             if isinstance(light, dr.AmbientLight):
                 lights.append({"type": "ambient", "ambient": np.asarray(light.color, float)})
                 continue
-            values = {k: np.asarray(v, float) for k, v in vars(light).items() if v is not None}
+            given = {k: v for k, v in vars(light).items() if v is not None and k != "shadow"}
+            values = {k: np.asarray(v, float) for k, v in given.items()}
             lights.append({"type": kinds[type(light)], **values})
         return lights
 

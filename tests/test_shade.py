@@ -13,6 +13,7 @@ from diffrast.light import (
     AmbientLight,
     DirectionalLight,
     PointLight,
+    SpotLight,
     incoming,
     normalize_columns,
     total_ambient,
@@ -28,6 +29,14 @@ DIRECTIONAL = {
     "specular": (0.3, 0.5, 0.2),
 }
 POINT = {"position": (0.5, 3.0, 2.0), "diffuse": (0.9, 0.4, 0.1), "specular": (1.0, 0.2, 0.6)}
+
+SPOT = {
+    "position": (0.5, 1.0, 2.0),
+    "direction": (-0.3, -1.0, -2.0),
+    "cutoff": 0.9,
+    "diffuse": (0.2, 0.9, 0.5),
+    "specular": (0.7, 0.4, 0.1),
+}
 
 
 def three_lights(**point):
@@ -113,6 +122,21 @@ def test_attenuation_dims_all_but_the_ambient_part():
     np.testing.assert_allclose(dimmed - ambient, (full - ambient) / 4, rtol=1e-5)
 
 
+@pytest.mark.parametrize("cutoff", [1e-4, 0.3, 1.5])
+def test_a_spot_fades_towards_its_cutoff(cutoff):
+    """1 - (1 - cos a) / (1 - cos cutoff), to the precision of float32 in narrow cones as well."""
+    angles = cutoff * np.array([0, 0.1, 0.5, 0.99, 1.01, 1.9])
+    rays = np.stack([np.sin(angles), np.zeros(6), -np.cos(angles)], axis=1)
+    light = SpotLight(position=(0, 0, 0), direction=(0, 0, -3), cutoff=cutoff)
+    _, factor = incoming(light, columns(2 * rays))
+    want = np.maximum(1 - (np.sin(angles / 2) / np.sin(cutoff / 2)) ** 2, 0)
+    np.testing.assert_allclose(factor, want, atol=1e-6)
+    _, dimmed = incoming(
+        dataclasses.replace(light, attenuation=jnp.array([0.0, 0, 1])), columns(2 * rays)
+    )
+    np.testing.assert_allclose(dimmed, want / 4, atol=1e-6)
+
+
 def test_total_ambient_is_the_sum_over_all_lights():
     dark = DirectionalLight(direction=(0, 0, 1))
     assert total_ambient(()) is None
@@ -165,7 +189,8 @@ def test_colors_equal_the_oracle(specular):
         diffuse=(0.3, 0.5, 0.9), ambient=(0.4, 0.1, 0.2), specular=specular, shininess=7.0
     )
     normal, position, to_viewer = random_points(200)
-    got = shaded(normal, position, to_viewer, material, three_lights())
+    lights = (*three_lights(), SpotLight(**SPOT))
+    got = shaded(normal, position, to_viewer, material, lights)
     want = reference.shade(
         position,
         reference.normalize(normal),
@@ -174,6 +199,7 @@ def test_colors_equal_the_oracle(specular):
             {"type": "ambient", "ambient": AMBIENT["color"]},
             {"type": "directional", **DIRECTIONAL},
             {"type": "point", **POINT},
+            {"type": "spot", **SPOT},
         ],
         {
             "ambient": (0.4, 0.1, 0.2),
@@ -219,7 +245,7 @@ def test_derivatives_in_everything():
         material = Material(
             diffuse=(0.3, 0.5, 0.9), ambient=(0.4, 0.1, 0.2), specular=(1, 0.7, 0.5), shininess=7.0
         )
-        lights = three_lights(attenuation=(0.5, 0.25, 0.125))
+        lights = (*three_lights(attenuation=(0.5, 0.25, 0.125)), SpotLight(**SPOT))
         check_derivatives(shaded, normal, position, to_viewer, material, lights)
 
 
@@ -230,6 +256,8 @@ DEGENERATE = {
         "position": (0, 0, 0),
         "to_viewer": towards(0.3),
         "light": (0.1, 0.2, -1),
+        "spot": POINT["position"],
+        "cutoff": 1.2,
     },
     "light at the point": {"position": POINT["position"]},
     "no normal": {"normal": (0, 0, 0)},
@@ -238,6 +266,8 @@ DEGENERATE = {
     "light along the surface": {**HEAD_ON, "light": (-1, 0, 0)},
     "viewer exactly in the mirror direction": HEAD_ON,
     "no direction of light": {"light": (0, 0, 0)},
+    "on the axis of a spot": {"position": (0, 0, 0), "light": tuple(-x for x in POINT["position"])},
+    "no cone": {"cutoff": 0.0},
     "everything at once": {
         "normal": (0, 0, 0),
         "to_viewer": (0, 0, 0),
@@ -255,6 +285,12 @@ def jacobians():
         lights = (
             DirectionalLight(direction=parameters["light"], specular=(1, 1, 1)),
             PointLight(**POINT, attenuation=parameters["attenuation"]),
+            SpotLight(
+                position=parameters["spot"],
+                direction=parameters["light"],
+                cutoff=parameters["cutoff"],
+                attenuation=parameters["attenuation"],
+            ),
         )
         material = Material(specular=(1, 1, 1), shininess=parameters["shininess"])
         vectors = (parameters[name][None] for name in ("normal", "position", "to_viewer"))
@@ -332,6 +368,12 @@ def test_precision_is_that_of_the_input():
         (lambda: PointLight(position=(0, 0, 0), diffuse=(1, 2, np.nan)), "diffuse: wanted finite"),
         (lambda: PointLight(position=(0, 0, 0), specular=(1, 2)), r"specular: wanted shape \(3,\)"),
         (lambda: PointLight(position=(0, 0, 0), attenuation=(1, 2)), r"attenuation: wanted shape"),
+        (
+            lambda: SpotLight(**{**SPOT, "cutoff": 1.6}),
+            "cutoff: wanted a number between 0 and 1.5708, got 1.6",
+        ),
+        (lambda: SpotLight(**{**SPOT, "cutoff": 0.0}), "cutoff: wanted a number between 0"),
+        (lambda: SpotLight(**{**SPOT, "direction": (0, 1)}), r"direction: wanted shape \(3,\)"),
         (lambda: Material(diffuse=(1, 2)), r"diffuse: wanted shape \(3,\), got \(2,\)"),
         (lambda: Material(ambient=(1, np.nan, 2)), "ambient: wanted finite numbers, got nan"),
         (lambda: Material(specular=1.0), r"specular: wanted shape \(3,\), got \(\)"),

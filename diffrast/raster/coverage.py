@@ -72,9 +72,25 @@ def visible_faces(
 
     Not differentiable: pass stopped gradients. Under `vmap` the views are drawn one after another.
     """
+    return _draw(positions_clip, faces, height, width, cull_backfaces)[0]
 
+
+@partial(jax.jit, static_argnames=("size",))
+def faces_and_depths(
+    positions_clip: Float[Array, "V 4"], faces: Int[Array, "F 3"], *, size: int
+) -> tuple[Int[Array, "size size"], Float[Array, "size size"]]:
+    """Ids as `visible_faces` gives them, of front and back faces, and the depth keys.
+
+    The key is 1/w, or -z/w where all vertices have the same w; -inf where there is no face.
+    """
+    return _draw(positions_clip, faces, size, size, False)
+
+
+def _draw(
+    positions_clip: Array, faces: Array, height: int, width: int, cull_backfaces: bool
+) -> tuple[Array, Array]:
     @jax.custom_batching.sequential_vmap
-    def draw(positions_clip: Array, faces: Array) -> Array:
+    def draw(positions_clip: Array, faces: Array) -> tuple[Array, Array]:
         vertices = snap_vertices(positions_clip, height=height, width=width)
         classes = classify_faces(
             vertices, faces, height=height, width=width, cull_backfaces=cull_backfaces
@@ -91,7 +107,7 @@ def visible_faces(
             buffer = _draw_sweeps(
                 buffer, vertices, faces, order, (starts[size], starts[size + 1]), image, set_up
             )
-        return _face_ids(buffer)[:height, :width]
+        return _face_ids(buffer)[:height, :width], buffer.real[:height, :width]
 
     return draw(positions_clip, faces)
 

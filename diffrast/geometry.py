@@ -1,0 +1,164 @@
+"""A scene as one mesh in the world, and the points of it that are seen."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from diffrast._stored import stored_rows
+from diffrast._topology import Edges, Topology, traced_topology
+from diffrast.camera import Camera, world_to_clip
+from diffrast.interpolate import interpolate_columns
+from diffrast.light import Columns
+from diffrast.linalg import mirrors, transform_normals, transform_points
+from diffrast.mesh import face_normals, vertex_normals
+from diffrast.raster.coverage import visible_faces
+from diffrast.raster.fragments import evaluate_fragments
+from diffrast.scene import Scene
+
+_SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
+
+
+class Geometry(NamedTuple):
+    """All objects of a scene as one mesh in the world."""
+
+    positions: Float[Array, "V 3"]
+    faces: Int[Array, "F 3"]
+    faces_outward: Int[Array, "F 3"]  # turned round where a transform mirrors
+    normals: Float[Array, "V 3"] | None  # None for flat and unlit shading
+    uvs: Float[Array, "V 2"] | None
+    object_of_face: Int[Array, " F"]
+    object_of_vertex: Int[Array, " V"]
+
+
+class Points(NamedTuple):
+    """Points on faces: the pixels of an image, or a row of them."""
+
+    face: Int[Array, "*size"]
+    barycentrics: Columns
+    inverse_depth: Float[Array, "*size"]
+
+
+def world_geometry(scene: Scene, shading: str) -> Geometry:
+    """All objects in the world, with what this shading needs of them."""
+    with jax.named_scope("geometry"):
+        positions, faces, faces_outward, normals, uvs = [], [], [], [], []
+        smooth = shading in ("phong", "gouraud")
+        textured = any(item.mesh.uvs is not None for item in scene.objects)
+        first_vertex = 0
+        for item in scene.objects:
+            mesh = item.mesh
+            positions.append(transform_points(item.transform, mesh.vertices))
+            faces.append(mesh.faces + first_vertex)
+            turned = jnp.where(mirrors(item.transform), faces[-1][:, ::-1], faces[-1])
+            faces_outward.append(turned)
+            first_vertex += mesh.vertices.shape[0]
+            if smooth:
+                own = mesh.normals
+                if own is None:
+                    own = vertex_normals(mesh.vertices, mesh.faces)
+                normals.append(transform_normals(item.transform, own))
+            if textured:
+                own = mesh.uvs
+                none = jnp.zeros_like(mesh.vertices[:, :2])
+                uvs.append(none if own is None else own)
+        all_faces = jnp.concatenate(faces)
+
+        def joined(parts: list[Array]) -> Array:
+            return stored_rows(jnp.concatenate(parts))
+
+        counts = np.arange(len(scene.objects), dtype=np.int32)
+        return Geometry(
+            joined(positions),
+            all_faces,
+            jnp.concatenate(faces_outward),
+            joined(normals) if smooth else None,
+            joined(uvs) if textured else None,
+            jnp.asarray(np.repeat(counts, [o.mesh.faces.shape[0] for o in scene.objects])),
+            jnp.asarray(np.repeat(counts, [o.mesh.vertices.shape[0] for o in scene.objects])),
+        )
+
+
+def clip_positions(geometry: Geometry, camera: Camera) -> Float[Array, "V 4"]:
+    """All vertices as the camera sees them."""
+    with jax.named_scope("project"):
+        return stored_rows(world_to_clip(camera, geometry.positions))
+
+
+def visible_points(
+    geometry: Geometry, positions_clip: Array, height: int, width: int, cull_backfaces: bool
+) -> Points:
+    """What each pixel centre sees."""
+    with jax.named_scope("rasterize"):
+        face = visible_faces(
+            jax.lax.stop_gradient(positions_clip),
+            geometry.faces_outward if cull_backfaces else geometry.faces,
+            height=height,
+            width=width,
+            cull_backfaces=cull_backfaces,
+        )
+    with jax.named_scope("fragments"):
+        return Points(face, *evaluate_fragments(positions_clip, geometry.faces, face))
+
+
+def at_points(attribute: Array, geometry: Geometry, points: Points) -> Columns:
+    """Values at the vertices, (V, C), interpolated at points."""
+    columns = [attribute[:, i] for i in range(attribute.shape[1])]
+    return interpolate_columns(columns, geometry.faces, points.face, points.barycentrics)
+
+
+def flat_normals(geometry: Geometry, face: Array) -> Columns:
+    """Unit normals of faces."""
+    normals = face_normals(geometry.positions, geometry.faces_outward)
+    visible = jnp.maximum(face, 0)
+    return [normals[:, i][visible] for i in range(3)]
+
+
+def scene_topology(scene: Scene, geometry: Geometry) -> Topology:
+    """Which faces of the scene meet where; objects have no edges in common."""
+    meshes = [item.mesh for item in scene.objects]
+    own = [
+        traced_topology(m.vertices, m.faces) if m.topology is None else m.topology for m in meshes
+    ]
+    first_faces = np.cumsum([0] + [m.faces.shape[0] for m in meshes])
+    first_vertices = np.cumsum([0] + [m.vertices.shape[0] for m in meshes])
+
+    def moved(faces: Array, by: int) -> Array:
+        return jnp.where(faces >= 0, faces + by, -1)
+
+    edges = [
+        part.edges._replace(faces=moved(part.edges.faces, int(first)))
+        for part, first in zip(own, first_faces, strict=False)
+    ]
+    bodies = [jnp.zeros_like(t.patches) if t.bodies is None else t.bodies for t in own]
+
+    def numbered(parts: list[Array]) -> Array:
+        return jnp.concatenate([p + int(v) for p, v in zip(parts, first_vertices, strict=False)])
+
+    return Topology(
+        Edges(*(jnp.concatenate(column) for column in zip(*edges, strict=True))),
+        jnp.concatenate(
+            [moved(t.neighbors, int(f)) for t, f in zip(own, first_faces, strict=False)]
+        ),
+        numbered([t.patches for t in own]),
+        None if len(own) == 1 and own[0].bodies is None else numbered(bodies),
+    )
+
+
+def apart_edges(geometry: Geometry, edges: Edges, shading: str) -> Array:
+    """Edges between two faces whose colours may differ there though both are seen."""
+    if shading == "flat":
+        return jnp.ones_like(edges.seam)
+    if geometry.normals is None:
+        return jnp.zeros_like(edges.seam)
+    differs = jnp.zeros_like(edges.seam)
+    for k in range(2):
+        corner = edges.corners // 3 if k == 0 else edges.corners % 3
+        vertex = [geometry.faces[jnp.maximum(edges.faces[:, i], 0), corner[:, i]] for i in range(2)]
+        one, other = (geometry.normals[v] for v in vertex)
+        largest = jnp.max(jnp.abs(one), axis=1) + jnp.max(jnp.abs(other), axis=1)
+        differs = differs | (jnp.max(jnp.abs(one - other), axis=1) > _SAME_NORMAL * largest)
+    return edges.seam & differs

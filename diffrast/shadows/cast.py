@@ -1,0 +1,142 @@
+"""The shadows of all lights of a scene."""
+
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from diffrast._stored import stored
+from diffrast.geometry import Geometry, Points, at_points
+from diffrast.light import Light, ShiningLight, casts_shadow
+from diffrast.linalg import dot
+from diffrast.shadows.lit import Rays, lit
+from diffrast.shadows.maps import Pictures, Plan, plan, take
+from diffrast.shadows.views import LightView, Seen, is_parallel, light_view, see, sides
+
+Reached: TypeAlias = tuple[Array | None, ...]  # by each light: 1 at points it reaches, or 0
+
+
+class _Regard(NamedTuple):
+    """How one light sees points, and which of them it shines on if nothing is between."""
+
+    seen: Seen
+    asked: Bool[Array, "*size"]
+
+
+class Shadows(NamedTuple):
+    """What all lights that cast shadows see."""
+
+    views: tuple[LightView, ...]
+    windows: tuple[Float[Array, "sides 4"], ...]
+    pictures: tuple[Pictures, ...]  # one for each resolution, in ascending order
+
+
+def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple[Shadows, Reached]:
+    """Take the pictures of the lights that cast shadows, fitted to points.
+
+    Args:
+        lights: of the scene.
+        geometry: of the scene.
+        points: that shadows may fall on.
+
+    Returns:
+        The shadows, and what `receive` tells of these points.
+    """
+    lights, geometry, points = lax.stop_gradient((lights, geometry, points))
+    casting = [light for light in lights if casts_shadow(light)]
+    with jax.named_scope("shadow"):
+        views = [light_view(light, geometry.positions) for light in casting]
+        regards = _regards(casting, views, geometry, points)
+        windows, plans = zip(
+            *(
+                plan(light, view, seen, asked)
+                for light, view, (seen, asked) in zip(casting, views, regards, strict=True)
+            ),
+            strict=True,
+        )
+        pictures = []
+        for size, members in _by_resolution(casting):
+            joined = zip(*(plans[i] for i in members), strict=True)
+            together = Plan(*(jnp.concatenate(column) for column in joined))
+            pictures.append(take(together, geometry, size))
+        shadows = Shadows(tuple(views), windows, tuple(pictures))
+        return shadows, _reached(lights, shadows, geometry, points, regards)
+
+
+def receive(
+    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, points: Points
+) -> Reached:
+    """1 where a light reaches points, 0 where it does not, None for a light without shadows.
+
+    Arguments as of `cast`; points far away from those that the shadows were cast for have whatever
+    shadow is near.
+    """
+    lights, geometry, points = lax.stop_gradient((lights, geometry, points))
+    casting = [light for light in lights if casts_shadow(light)]
+    with jax.named_scope("shadow"):
+        regards = _regards(casting, list(shadows.views), geometry, points)
+        return _reached(lights, shadows, geometry, points, regards)
+
+
+def _by_resolution(lights: list[ShiningLight]) -> list[tuple[int, list[int]]]:
+    """Resolutions in ascending order, each with the numbers of its lights."""
+    sizes = [light.shadow.resolution for light in lights if light.shadow is not None]
+    return [(size, [i for i, s in enumerate(sizes) if s == size]) for size in sorted(set(sizes))]
+
+
+def _regards(
+    lights: list[ShiningLight], views: list[LightView], geometry: Geometry, points: Points
+) -> list[_Regard]:
+    position = at_points(geometry.positions, geometry, points)
+    visible = jnp.maximum(points.face, 0)
+    regards = []
+    for light, view in zip(lights, views, strict=True):
+        seen = stored(see(light, view, position))
+        turned = _turned_to(light, view, geometry)
+        regards.append(_Regard(seen, seen.inside & turned[visible] & (points.face >= 0)))
+    return regards
+
+
+def _reached(
+    lights: tuple[Light, ...],
+    shadows: Shadows,
+    geometry: Geometry,
+    points: Points,
+    regards: list[_Regard],
+) -> Reached:
+    """Look at all points of all lights of one resolution at once."""
+    casting = [light for light in lights if casts_shadow(light)]
+    reached: dict[int, Array] = {}
+    face, shape = jnp.ravel(points.face), points.face.shape
+    barycentrics = jnp.stack([jnp.ravel(b) for b in points.barycentrics])
+    for pictures, (_, members) in zip(shadows.pictures, _by_resolution(casting), strict=True):
+        parts, first = [], 0
+        for i in members:
+            seen, asked = regards[i]
+            window = shadows.windows[i]
+            scale_x, scale_y, offset_x, offset_y = (
+                window[0] if sides(casting[i]) == 1 else window.T[:, seen.side]
+            )
+            x, y = stored((scale_x * seen.x + offset_x, scale_y * seen.y + offset_y))
+            columns = seen.side + first, x, y, seen.key, seen.unit, asked
+            parts.append(Rays(face, barycentrics, *map(jnp.ravel, columns)))
+            first += sides(casting[i])
+        together = zip(*parts, strict=True)
+        rays = Rays(*(jnp.concatenate(column, axis=-1) for column in together))
+        bright = lit(pictures, geometry, rays).reshape(len(members), *shape)
+        reached.update(zip(members, bright, strict=True))
+    numbers = iter(range(len(casting)))
+    return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)
+
+
+def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " F"]:
+    """Whether the light is on that side of faces which the normals at their corners point to."""
+    corners = geometry.positions[geometry.faces_outward]
+    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    to_light = -view.axes[2] if is_parallel(light) else view.origin - corners[:, 0]
+    inside_out = jnp.zeros(normal.shape[0], bool)
+    if geometry.normals is not None:
+        inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces], axis=1)) < 0
+    return jnp.where(inside_out, -1, 1) * dot(normal, to_light) > 0

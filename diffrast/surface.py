@@ -1,0 +1,141 @@
+"""The colours of points on faces, one function a kind of shading."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from diffrast.camera import Camera, viewpoint
+from diffrast.geometry import Geometry, Points, at_points, flat_normals
+from diffrast.light import (
+    AmbientLight,
+    Columns,
+    Light,
+    casts_shadow,
+    normalize_columns,
+    without_ambient,
+)
+from diffrast.scene import Scene
+from diffrast.shade import Reflectance, Surface, needs, phong
+from diffrast.shadows import Reached, Shadows, cast, receive
+
+
+class World(NamedTuple):
+    """What shading knows besides the points."""
+
+    scene: Scene
+    camera: Camera
+    geometry: Geometry
+    shadows: Shadows | None
+
+
+def cast_shadows(
+    scene: Scene, camera: Camera, geometry: Geometry, points: Points, shading: str
+) -> tuple[World, Reached]:
+    """The world with the shadows that fall on points, and which lights reach those."""
+    if shading == "unlit" or not any(map(casts_shadow, scene.lights)):
+        return World(scene, camera, geometry, None), (None,) * len(scene.lights)
+    shadows, reached = cast(scene.lights, geometry, points)
+    return World(scene, camera, geometry, shadows), reached
+
+
+def receive_shadows(world: World, points: Points) -> Reached:
+    """Which lights reach points."""
+    if world.shadows is None:
+        return (None,) * len(world.scene.lights)
+    return receive(world.scene.lights, world.shadows, world.geometry, points)
+
+
+def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
+    scene, camera, geometry, _ = world
+    if geometry.normals is None:
+        normal = flat_normals(geometry, points.face)
+    else:
+        normal = at_points(geometry.normals, geometry, points)
+    reflectance = _reflectance(scene, geometry.object_of_face, points.face)
+    with_position, with_viewer = needs(scene.lights, reflectance.specular is not None)
+    position = at_points(geometry.positions, geometry, points) if with_position else None
+    to_viewer = _to_viewer(camera, position) if with_viewer else None
+    surface = Surface(normal, position, to_viewer)
+    return phong(surface, reflectance, scene.lights, reached)
+
+
+def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
+    """Interpolate the colours of vertices; of each light with shadows apart, which are sharp."""
+    scene, camera, geometry, _ = world
+    assert geometry.normals is not None
+    vertices = jnp.arange(geometry.positions.shape[0])
+    reflectance = _reflectance(scene, geometry.object_of_vertex, vertices)
+    position = [geometry.positions[:, i] for i in range(3)]
+    normal = [geometry.normals[:, i] for i in range(3)]
+    _, with_viewer = needs(scene.lights, reflectance.specular is not None)
+    to_viewer = _to_viewer(camera, position) if with_viewer else None
+    surface = Surface(normal, position, to_viewer)
+
+    def at_vertices(lights: tuple[Light, ...]) -> Columns:
+        color = phong(surface, reflectance, lights)
+        return at_points(jnp.stack(color, axis=-1), geometry, points)
+
+    everywhere, alone = [], []
+    for light, part in zip(scene.lights, reached, strict=True):
+        if part is None or isinstance(light, AmbientLight):
+            everywhere.append(light)
+            continue
+        alone.append(without_ambient(light))
+        if light.ambient is not None:
+            everywhere.append(AmbientLight(light.ambient))
+    color = at_vertices(tuple(everywhere))
+    parts = [part for part in reached if part is not None]
+    for light, part in zip(alone, parts, strict=True):
+        color = [c + part * own for c, own in zip(color, at_vertices((light,)), strict=True)]
+    return color
+
+
+def _shade_unlit(world: World, points: Points, reached: Reached) -> Columns:
+    scene, geometry = world.scene, world.geometry
+    diffuse = _reflectance(scene, geometry.object_of_face, points.face).diffuse
+    return [jnp.broadcast_to(channel, points.face.shape) for channel in diffuse]
+
+
+SHADERS: dict[str, Callable[[World, Points, Reached], Columns]] = {
+    "phong": _shade_phong,
+    "gouraud": _shade_gouraud,
+    "flat": _shade_phong,
+    "unlit": _shade_unlit,
+}
+
+
+def _to_viewer(camera: Camera, position: Columns | None) -> Columns:
+    assert position is not None
+    eye = viewpoint(camera)
+    return normalize_columns([eye[i] - eye[3] * position[i] for i in range(3)])[0]
+
+
+def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
+    """Material at each point: numbers if there is one object, else looked up by object."""
+    materials = [item.material for item in scene.objects]
+    specular = [m.specular for m in materials if m.specular is not None]
+    if len(materials) == 1:
+        material = materials[0]
+        return Reflectance(
+            [material.ambient[c] for c in range(3)],
+            [material.diffuse[c] for c in range(3)],
+            None if material.specular is None else [material.specular[c] for c in range(3)],
+            material.shininess if specular else None,
+        )
+    which = object_of[jnp.maximum(index, 0)]
+
+    def looked_up(values: list[Array]) -> Columns:
+        table = jnp.stack(values)
+        return [table[:, c][which] for c in range(3)]
+
+    none = jnp.zeros(3, scene.background.dtype)
+    return Reflectance(
+        looked_up([m.ambient for m in materials]),
+        looked_up([m.diffuse for m in materials]),
+        looked_up([none if m.specular is None else m.specular for m in materials])
+        if specular
+        else None,
+        jnp.stack([m.shininess for m in materials])[which] if specular else None,
+    )
