@@ -34,7 +34,14 @@ from diffrast.edges.pieces import (
     no_pieces,
     to_pixels,
 )
-from diffrast.edges.piercing import PIXELS_AT_ONCE, Line, choose_pixels, cross, line_of
+from diffrast.edges.piercing import (
+    PIXELS_AT_ONCE,
+    Line,
+    choose_pixels,
+    cross,
+    keep_near_crossings,
+    line_of,
+)
 from diffrast.edges.visibility import BACKGROUND, Seen, look
 
 _ROWS_AT_ONCE = 1024
@@ -178,7 +185,9 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     if bodies is None:
         return blended
 
-    order, pixel_count = choose_pixels(view.face_image, bodies)
+    order, pixel_count = keep_near_crossings(
+        *choose_pixels(view.face_image, bodies), view.faces, pixels, bodies, view.face_image
+    )
 
     def add_pixels(n: Array, total: Blended) -> Blended:
         slots = n * PIXELS_AT_ONCE + jnp.arange(PIXELS_AT_ONCE)

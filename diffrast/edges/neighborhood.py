@@ -38,7 +38,7 @@ def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[A
 
 def _across(face: Array, without: Array, neighbors: Array) -> Array:
     """The two faces next to each face that are not `without`, which is one of three or none."""
-    near = _next_to(face, neighbors)
+    near = jnp.where(face >= 0, neighbors.T[:, jnp.maximum(face, 0)], -1)
     return jnp.where(near[:2] == without, near[2], near[:2])
 
 

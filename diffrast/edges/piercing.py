@@ -16,17 +16,19 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import only, picked, pixels_round
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import TOLERANCE, Table, corners_of
+from diffrast.edges.planes import TOLERANCE, Table, corners_of, edge_values
 from diffrast.raster.fixed_point import CULLED, group_by_class
 
 PIXELS_AT_ONCE = 64
+_TESTED_AT_ONCE = 512
+_WINDOW = 3.0  # pixels from the centre
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
@@ -79,6 +81,48 @@ def choose_pixels(
     return order, starts[1]
 
 
+def keep_near_crossings(
+    order: Int[Array, " pixels"],
+    count: Int[Array, ""],
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+    bodies: Int[Array, " F"],
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> tuple[Int[Array, " pixels"], Int[Array, ""]]:
+    """Of chosen pixels those round which the planes of the two bodies' faces change places."""
+    width = face_image.shape[1] - 2
+
+    def step(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        kept, total = state
+        slots = n * _TESTED_AT_ONCE + jnp.arange(_TESTED_AT_ONCE)
+        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+        row, column = number // width, number % width
+        face = stored(pixels_round(face_image, column, row))
+        body = stored(jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1))
+        one, other = stored(_two_bodies(body))
+        pair = jnp.stack([picked(face, one), picked(face, other)])[:, None]
+        corner = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])[:, :, None] * _WINDOW
+        x, y = jnp.stack([column, row])[:, None] + 0.5 + corner
+        _, depth = edge_values(corners_of(pair, faces, pixels), x, y)
+        apart = depth[0] - depth[1]
+        known = jnp.all(depth != -1, axis=(0, 1))
+        changes = ~(jnp.all(apart > 0, axis=0) | jnp.all(apart < 0, axis=0))
+        keep = (slots < count) & (~known | changes)
+        slot = jnp.where(keep, total + jnp.cumsum(keep) - 1, order.shape[0])
+        return kept.at[slot].set(number, mode="drop"), total + jnp.sum(keep)
+
+    chunks = (count + _TESTED_AT_ONCE - 1) // _TESTED_AT_ONCE
+    return lax.fori_loop(0, chunks, step, (order, count & 0))
+
+
+def _two_bodies(body: Array) -> tuple[Array, Array]:
+    """Rows of the first one that is there, and of the first other."""
+    row = jnp.arange(body.shape[0])[:, None]
+    one = jnp.min(jnp.where(body >= 0, row, row.size - 1), axis=0)
+    differs = (body >= 0) & (body != picked(body, one))
+    return one, jnp.min(jnp.where(differs, row, row.size - 1), axis=0)
+
+
 def cross(
     pixel: Int[Array, "2 n"],
     exists: Bool[Array, " n"],
@@ -128,8 +172,7 @@ def _candidates(
     nearest_first = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
     face = pictured[nearest_first]
     body = jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1)
-    one = jnp.argmax(face >= 0, axis=0)
-    other = jnp.argmax((face >= 0) & (body != picked(body, one)), axis=0)
+    one, other = _two_bodies(body)
     seen = jnp.stack([one, other])
     look = jnp.concatenate(
         [
