@@ -117,7 +117,7 @@ def flat_normals(geometry: Geometry, face: Array) -> Columns:
     return [normals[:, i][visible] for i in range(3)]
 
 
-def scene_topology(scene: Scene, geometry: Geometry) -> Topology:
+def scene_topology(scene: Scene) -> Topology:
     """Which faces of the scene meet where; objects have no edges in common."""
     meshes = [item.mesh for item in scene.objects]
     own = [

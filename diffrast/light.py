@@ -288,3 +288,8 @@ def normalize_columns(vector: Columns) -> tuple[Columns, Array]:
     length = jnp.sqrt(jnp.where(positive, square, 1))
     unit = jnp.where(positive, 1, 0) / length
     return [component * unit for component in scaled], jnp.where(positive, length * largest, 0)
+
+
+def dot_columns(a: Columns | Array, b: Columns | Array) -> Array:
+    """Dot products of vectors kept as columns."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

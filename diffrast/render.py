@@ -166,7 +166,7 @@ def _with_edges(
     settings: RenderSettings,
 ) -> Array:
     geometry = world.geometry
-    topology = scene_topology(world.scene, geometry)
+    topology = scene_topology(world.scene)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
     view = View(

@@ -16,6 +16,7 @@ from diffrast.light import (
     AmbientLight,
     Columns,
     Light,
+    dot_columns,
     incoming,
     needs_position,
     normalize_columns,
@@ -79,7 +80,7 @@ def phong(
         direction, factor = incoming(light, surface.position)
         if part is not None:
             factor = part if factor is None else part * factor
-        cosine = _dot(normal, direction)
+        cosine = dot_columns(normal, direction)
         diffuse = jnp.maximum(cosine, 0)
         if factor is not None:
             diffuse = diffuse * factor
@@ -106,11 +107,7 @@ def _highlight(
     The power is exp(m log x) behind a mask: finite, with finite derivatives, also at x = 0. What
     rounding adds to x = 1 is cut off, since a large m would make it infinite.
     """
-    along = 2 * cosine * _dot(normal, to_viewer) - _dot(to_light, to_viewer)
+    along = 2 * cosine * dot_columns(normal, to_viewer) - dot_columns(to_light, to_viewer)
     visible = (along > 0) & (cosine > 0)
     power = jnp.exp(shininess * jnp.log(jnp.where(visible & (along < 1), along, 1)))
     return jnp.where(visible, power, 0)
-
-
-def _dot(a: Columns, b: Columns) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -224,6 +224,19 @@ def save_comparison(
     dr.save_image(path, np.concatenate([*encoded, difference], axis=1), srgb=False)
 
 
+def statistics(outcomes: list[dict[str, Any]], criterion: dict[str, float]) -> dict[str, Any]:
+    """Share of fits that converged, which did not, and medians over all of them."""
+
+    def median(key: str) -> float:
+        return float(np.median([outcome[key] for outcome in outcomes]))
+
+    return {
+        "share_converged": float(np.mean([outcome["converged"] for outcome in outcomes])),
+        "failed": [i for i, outcome in enumerate(outcomes) if not outcome["converged"]],
+        **{f"median_{key}": median(key) for key in (*criterion, "renders", "seconds")},
+    }
+
+
 def save_json(path: Path, content: Any) -> None:
     """Write a result; arrays become lists, floats keep six digits."""
     path.parent.mkdir(parents=True, exist_ok=True)

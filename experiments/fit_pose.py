@@ -28,7 +28,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, save_json
+from common import pyplot, save_json, statistics
 from fitting import Patience
 from jax import Array
 
@@ -177,7 +177,7 @@ def run(
         "degrees": degrees,
         "percent": percent,
         "seed": seed,
-        "methods": {name: statistics([row[name] for row in rows]) for name in settings},
+        "methods": {name: statistics([row[name] for row in rows], CRITERION) for name in settings},
         "seconds": time.perf_counter() - began,
         "starts": rows,
     }
@@ -185,15 +185,6 @@ def run(
     before, after = (picture(mesh, pose, exact) for pose in pairs[0])
     plot(out / "fit_pose.png", (target, before, after), rows)
     return report
-
-
-def statistics(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Share of starts that converged, and medians over all of them."""
-    names = (*CRITERION, "renders", "seconds")
-    return {
-        "share_converged": np.mean([outcome["converged"] for outcome in outcomes]),
-        **{f"median_{name}": np.median([outcome[name] for outcome in outcomes]) for name in names},
-    }
 
 
 def plot(path: Path, images: tuple[Array, Array, Array], rows: list[dict[str, Any]]) -> None:

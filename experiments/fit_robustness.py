@@ -28,7 +28,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import optax
-from common import DEFAULT_TARGET, View, load_problem, pyplot, render_view, save_json
+from common import (
+    DEFAULT_TARGET,
+    View,
+    load_problem,
+    pyplot,
+    render_view,
+    save_json,
+    statistics,
+)
 from fitting import (
     RADIUS,
     Level,
@@ -153,7 +161,7 @@ def run(
         "size": size,
         "degrees": degrees,
         "seed": seed,
-        "methods": {name: _statistics([row[name] for row in rows]) for name in methods},
+        "methods": {name: statistics([row[name] for row in rows], CRITERION) for name in methods},
         "seconds": time.perf_counter() - started,
         "starts": rows,
     }
@@ -170,17 +178,6 @@ def _outcome(start: Start, fit: Callable[[Start], tuple[Any, int]], truth: View)
     converged = all(errors[key] <= limit for key, limit in CRITERION.items())
     seconds = time.perf_counter() - before
     return {"converged": converged, "renders": renders, "seconds": seconds, **errors}
-
-
-def _statistics(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
-    def median(key: str) -> float:
-        return float(np.median([outcome[key] for outcome in outcomes]))
-
-    return {
-        "share_converged": float(np.mean([outcome["converged"] for outcome in outcomes])),
-        "failed": [i for i, outcome in enumerate(outcomes) if not outcome["converged"]],
-        **{f"median_{key}": median(key) for key in (*CRITERION, "renders", "seconds")},
-    }
 
 
 def plot_outcomes(path: Path, rows: list[dict[str, Any]], methods: list[str]) -> None:
@@ -216,8 +213,8 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     report = run(options.pop("out"), progress=not options.pop("quiet"), **options)
-    for name, statistics in report["methods"].items():
-        print(name, statistics)
+    for name, found in report["methods"].items():
+        print(name, found)
 
 
 if __name__ == "__main__":

@@ -139,11 +139,11 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     edges = view.topology.edges
     pixels = to_pixels(view.positions_clip, height, width)
     volume = facing(pixels, view.faces)
-    seen = volume != 0
     if method.cull_backfaces:
-        seen = seen & ((volume < 0) if view.turned is None else (volume < 0) != view.turned)
-    drawn = stored(jnp.where(seen, volume, 0))
-    order, edge_count = choose_edges(edges, volume, seen, view.apart)
+        front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
+        volume = stored(jnp.where(front, volume, 0))
+    order, edge_count = choose_edges(edges, volume, view.apart)
+    has_background = jnp.any(view.face_image < 0)
 
     def add_edges(n: Array, total: Blended) -> Blended:
         slots = n * EDGES_AT_ONCE + jnp.arange(EDGES_AT_ONCE)
@@ -154,7 +154,6 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             view.faces,
             pixels,
             volume,
-            seen,
             height=height,
             width=width,
         )
@@ -167,7 +166,14 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
             pieces = cut(segments, ends, first_piece, height=height, width=width)
             pieces = jax.tree.map(lambda a, b: jnp.where(left.exists, a, b), left, pieces)
             found, left = look(
-                pieces, segments, view.faces, pixels, view.topology, drawn, view.face_image
+                pieces,
+                segments,
+                view.faces,
+                pixels,
+                view.topology,
+                volume,
+                view.face_image,
+                has_background,
             )
             total = _with_pieces(total, view, method, segments, pieces, found, first)
             return first_piece + PIECES_AT_ONCE, gathered(left), total
@@ -194,7 +200,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         number = order[jnp.minimum(slots, order.shape[0] - 1)]
         pixel = jnp.stack([number % width, number // width])
         exists = slots < pixel_count
-        crossings = cross(pixel, exists, view.faces, pixels, view.topology, seen, view.face_image)
+        crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
 
         def add_lines(n: Array, total: Blended) -> Blended:
             return _with_lines(total, view, method, pixel, line_of(crossings, n, pixel), first)

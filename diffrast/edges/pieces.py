@@ -77,10 +77,10 @@ def facing(pixels: Float[Array, "4 V"], faces: Int[Array, "F 3"]) -> Float[Array
     return stored(jnp.where(abs(volume) > _EDGE_ON * jnp.finfo(size.dtype).eps * size, volume, 0))
 
 
-def _sides(edges: Edges, volume: Array, seen: Array) -> tuple[Array, Array, Array]:
+def _sides(edges: Edges, volume: Array) -> tuple[Array, Array, Array]:
     """For both faces of edges: whether it is drawn, whether it lies on the right; and if a fold."""
     face = jnp.maximum(edges.faces.T, 0)
-    drawn = (edges.faces.T >= 0) & seen[face]
+    drawn = (edges.faces.T >= 0) & (volume[face] != 0)
     corners = edges.corners.T
     right = (volume[face] < 0) == ((corners // 3 + 1) % 3 == corners % 3)
     return drawn, right, (drawn[0] != drawn[1]) | (right[0] == right[1])
@@ -89,18 +89,16 @@ def _sides(edges: Edges, volume: Array, seen: Array) -> tuple[Array, Array, Arra
 def choose_edges(
     edges: Edges,
     volume: Float[Array, " F"],
-    seen: Bool[Array, " F"],
     apart: Bool[Array, " E"],
 ) -> tuple[Int[Array, " E"], Int[Array, ""]]:
     """Indices of the edges across which the picture may jump, in ascending order, and how many.
 
     Args:
         edges: of the mesh.
-        volume: result of `facing`.
-        seen: whether faces turn a side to the viewer that is drawn.
+        volume: result of `facing`, 0 for faces that are not drawn.
         apart: whether colours may jump across edges that are no folds.
     """
-    drawn, _, fold = _sides(edges, volume, seen)
+    drawn, _, fold = _sides(edges, volume)
     chosen = (drawn[0] | drawn[1]) & (fold | apart)
     order, starts = group_by_class(jnp.where(chosen, 0, CULLED))
     return order, starts[1]
@@ -113,14 +111,13 @@ def clip_edges(
     faces: Int[Array, "F 3"],
     pixels: Float[Array, "4 V"],
     volume: Float[Array, " F"],
-    seen: Bool[Array, " F"],
     *,
     height: int,
     width: int,
 ) -> Segments:
-    """Clip edges to the view and project them."""
+    """Clip edges to the view and project them. `volume` as in `choose_edges`."""
     edges = Edges(*(column[chosen] for column in edges))
-    drawn, right, fold = _sides(edges, volume, seen)
+    drawn, right, fold = _sides(edges, volume)
     corners = edges.corners.T
     vertices = stored(faces[edges.faces[:, 0], jnp.stack([corners[0] // 3, corners[0] % 3])])
     at = stored(pixels[:, vertices])  # (4, 2, n)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import only, picked, pixels_round
+from diffrast.edges.neighborhood import first_row, only, picked, pixels_round
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import TOLERANCE, Table, corners_of, edge_values
 from diffrast.raster.fixed_point import CULLED, group_by_class
@@ -117,10 +117,10 @@ def keep_near_crossings(
 
 def _two_bodies(body: Array) -> tuple[Array, Array]:
     """Rows of the first one that is there, and of the first other."""
-    row = jnp.arange(body.shape[0])[:, None]
-    one = jnp.min(jnp.where(body >= 0, row, row.size - 1), axis=0)
+    last = body.shape[0] - 1
+    one = jnp.minimum(first_row(body >= 0), last)
     differs = (body >= 0) & (body != picked(body, one))
-    return one, jnp.min(jnp.where(differs, row, row.size - 1), axis=0)
+    return one, jnp.minimum(first_row(differs), last)
 
 
 def cross(
@@ -129,12 +129,12 @@ def cross(
     faces: Int[Array, "F 3"],
     pixels: Table,
     topology: Topology,
-    drawn: Bool[Array, " F"],
+    volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Crossings:
     """Find where faces near pixels (column, row) pierce each other, seen or not."""
     assert topology.bodies is not None
-    face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, drawn, face_image)
+    face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, volume, face_image)
     planes, unit = _planes(pixel, face, look, faces, pixels)
     sums = stored(jnp.sum(planes.lambdas, axis=1))
     point, normal, inverse = stored(_line(sums[:, _ONE] - sums[:, _OTHER]))
@@ -165,7 +165,7 @@ def cross(
 
 
 def _candidates(
-    pixel: Array, bodies: Array, neighbors: Array, drawn: Array, face_image: Array
+    pixel: Array, bodies: Array, neighbors: Array, volume: Array, face_image: Array
 ) -> tuple[Array, Array, Array]:
     """Faces, the pixels of the 3×3 where they or faces next to them are seen, and their bodies."""
     pictured = stored(pixels_round(face_image, *pixel))
@@ -182,7 +182,7 @@ def _candidates(
     )
     parents = jnp.stack([picked(face, one), picked(face, other)])
     nearby = neighbors[jnp.maximum(parents, 0)].transpose(0, 2, 1).reshape(6, -1)
-    face = stored(jnp.concatenate([face, only(nearby, drawn)]))
+    face = stored(jnp.concatenate([face, only(nearby, volume != 0)]))
     return face, look, bodies[jnp.maximum(face, 0)]
 
 

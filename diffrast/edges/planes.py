@@ -49,9 +49,14 @@ def covers(values: Columns) -> Bool[Array, "*n"]:
 def locate(corners: Array, x: Array, y: Array) -> tuple[Bool[Array, "*n"], Columns]:
     """Whether faces cover points, and the barycentric coordinates there on their planes."""
     values, depth = edge_values(corners, x, y)
+    return covers(values) & (depth > 0), barycentrics(values)
+
+
+def barycentrics(values: Columns) -> Columns:
+    """Barycentric coordinates on the planes of faces, from their values."""
     total = values[0] + values[1] + values[2]
     inverse_total = 1 / jnp.where(total == 0, 1, total)
-    return covers(values) & (depth > 0), [value * inverse_total for value in values]
+    return [value * inverse_total for value in values]
 
 
 def inverse_depth_slope(corners: Array, direction: Array) -> Array:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import (
+    first_row,
     only,
     picked,
     pixel_at,
@@ -30,10 +31,10 @@ from diffrast.edges.planes import (
     Columns,
     Table,
     area,
+    barycentrics,
     corners_of,
     edge_values,
     inverse_depth_slope,
-    locate,
     on_edge,
 )
 from diffrast.edges.rim import Rim, look_inwards
@@ -81,11 +82,12 @@ def look(
     topology: Topology,
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
+    has_background: Bool[Array, ""],
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round.
+    one pixel all round; `has_background` tells whether any of its pixels is empty.
     """
     own, own_corners, fold, weights, ends, range_ = stored(
         (
@@ -102,7 +104,6 @@ def look(
     centre = pieces.pixel + 0.5
     start, along = ends[0] - centre, ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    is_bare = jnp.any(face_image < 0)
     inverse_length = 1 / jnp.where(length > 0, length, 1)
     normal = jnp.stack([along[1] * inverse_length, -along[0] * inverse_length])
     start, normal, length = stored((start, normal, length))
@@ -136,7 +137,8 @@ def look(
     values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
     patch = stored(topology.patches[jnp.maximum(around, 0)])
     fine = jnp.min(area(face_corners), axis=0) < _FINE
-    touching = (patch == topology.patches[jnp.maximum(front, 0)]) | fine
+    front_patch = stored(topology.patches[jnp.maximum(front, 0)])
+    touching = (patch == front_patch) | fine
     tolerance = stored(jnp.where(touching, FINE_TOLERANCE, TOLERANCE))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
@@ -184,8 +186,8 @@ def look(
     front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
-    fine = stored(area(corners_of(pictured, faces, pixels))) < _FINE
-    above = fine & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
+    tiny = stored(area(corners_of(pictured, faces, pixels))) < _FINE
+    above = tiny & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # Where nothing is found behind, and the surface at the pixel beyond ends before, it is bare.
@@ -194,14 +196,15 @@ def look(
     reached, there = walk(
         jnp.where(search, shown, -1), x, y, faces, pixels, topology.neighbors, volume
     )
+    reached = stored(jnp.where(search, reached, beyond))
     values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
+    at_beyond = barycentrics(values)
     lies = search & there & (reached >= 0) & (reached_depth <= near * (1 + FINE_TOLERANCE))
-    bare = pictured < 0
-    bare_look = jnp.min(jnp.where(bare, jnp.arange(9)[:, None], 9), axis=0)
-    gap = search & there & (reached < 0) & (shown >= 0) & is_bare
-    bare_look = jnp.where(bare_look < 9, bare_look, front_look)
+    gap = search & there & (reached < 0) & (shown >= 0) & has_background
     beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached, beyond)))
-    _, at_beyond = locate(corners_of(beyond, faces, pixels), x, y)
+    bare = pictured < 0
+    bare_look = first_row(bare)
+    bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
     # What the sides show may be seen at another pixel.
     patch = jnp.where(bare, -1, patch[:9])
@@ -228,9 +231,8 @@ def look(
     rim = rim._replace(smooth=rim.smooth & fold)
 
     # A flap of a curved surface, narrower than a pixel, in front of that surface itself.
-    shown = picked(pictured, beyond_look)
-    same = topology.patches[jnp.maximum(shown, 0)] == topology.patches[jnp.maximum(front, 0)]
-    flap = fold & ~rim.smooth & (beyond == -1) & (shown >= 0) & same
+    same = picked(patch, beyond_look) == front_patch
+    flap = fold & ~rim.smooth & (beyond == -1) & same
     seen = Seen(
         visible=visible & ~flap,
         fold=fold,
@@ -250,7 +252,7 @@ def look(
 def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Array:
     """Which of the 3×3 pixels shows the surface of a face: `look` if it does, or if none does."""
     same = (face >= 0) & (patch == patches[jnp.maximum(face, 0)])
-    first = jnp.min(jnp.where(same, jnp.arange(9)[:, None], 9), axis=0)
+    first = first_row(same)
     return jnp.where(picked(same, look) | (first == 9), look, first)
 
 

@@ -11,6 +11,7 @@ from diffrast._stored import stored
 from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, ShiningLight, casts_shadow
 from diffrast.linalg import dot
+from diffrast.mesh import face_normals
 from diffrast.shadows.lit import Rays, lit
 from diffrast.shadows.maps import Pictures, Plan, plan, take
 from diffrast.shadows.views import LightView, Seen, is_parallel, light_view, see, sides
@@ -133,9 +134,9 @@ def _reached(
 
 def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " F"]:
     """Whether the light is on that side of faces which the normals at their corners point to."""
-    corners = geometry.positions[geometry.faces_outward]
-    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    to_light = -view.axes[2] if is_parallel(light) else view.origin - corners[:, 0]
+    normal = face_normals(geometry.positions, geometry.faces_outward)
+    corner = geometry.positions[geometry.faces_outward[:, 0]]
+    to_light = -view.axes[2] if is_parallel(light) else view.origin - corner
     inside_out = jnp.zeros(normal.shape[0], bool)
     if geometry.normals is not None:
         inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces], axis=1)) < 0

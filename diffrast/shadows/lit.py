@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast.geometry import Geometry
+from diffrast.light import dot_columns
 from diffrast.raster.fixed_point import CULLED, group_by_class
 from diffrast.shadows.maps import Pictures
 
@@ -133,12 +134,12 @@ def _stops(corners: Array, ray: Array, *, endless: Array) -> Array:
     """Positive where faces, given from the beginning of rays, stop them before their end."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = _cross(b - a, c - a)
-    along, distance = _dot(normal, ray), _dot(normal, a)
+    along, distance = dot_columns(normal, ray), dot_columns(normal, a)
     sign = jnp.where(along < 0, -1, 1)
     inside = along != 0
     for start, end in ((a, b), (b, c), (c, a)):
-        inside = inside & (sign * _dot(ray, _cross(start, end)) >= 0)
-    rounding = _dot(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
+        inside = inside & (sign * dot_columns(ray, _cross(start, end)) >= 0)
+    rounding = dot_columns(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
     rounding = rounding * (_ROUNDINGS * jnp.finfo(corners.dtype).eps)
     before = sign * distance
     before = jnp.where(endless, before, jnp.minimum(before, sign * along - before))
@@ -161,7 +162,7 @@ def _slopes(pictures: Pictures, rays: Rays, corners: Array) -> tuple[list[Array]
 
     def determinant(*columns: int) -> Array:
         a, b, c = (row[jnp.array(columns)] for row in (first, one, other))
-        return _dot(a, _cross(b, c))
+        return dot_columns(a, _cross(b, c))
 
     volume = determinant(0, 1, 2)
     inverse = jnp.where(volume == 0, 0, 1) / jnp.where(volume == 0, 1, volume)
@@ -176,7 +177,3 @@ def _cross(a: Array, b: Array) -> Array:
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
