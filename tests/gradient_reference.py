@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from box_filter import render_box
-from reference import look_at, perspective
+from reference import look_at, orthographic, perspective
 
 import diffrast as dr
 
@@ -64,6 +64,7 @@ class Problem:
     eye: tuple
     target: tuple
     fov_y: float
+    window: float | None = None  # height of the view under parallel projection, instead of fov_y
     up: tuple = (0.08, 1.0, 0.03)
     near: float = 0.5
     far: float = 20.0
@@ -131,6 +132,8 @@ def moved(problem, params=None) -> tuple:
     view = motion @ look_at(problem.eye, problem.target, problem.up)
     tangent = np.tan(problem.fov_y / 2) * np.exp(params[6])
     projection = perspective(2 * np.arctan(tangent), 1.0, problem.near, problem.far)
+    if problem.window is not None:
+        projection = orthographic(problem.window, 1.0, problem.near, problem.far)
 
     positions, normals, faces, start = [], [], [], 0
     for index, thing in enumerate(problem.objects):

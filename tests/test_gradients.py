@@ -132,6 +132,31 @@ def test_derivatives_by_vertices():
     assert np.linalg.norm(ours - truth) < 0.07 * np.linalg.norm(truth)
 
 
+def test_parallel_projection_has_the_same_edges():
+    problem = replace(reference.piercing(), size=48, window=3.0)
+    frame = {"eye": problem.eye, "target": problem.target, "up": problem.up}
+    camera = dr.Camera.orthographic(height=3.0, near=problem.near, far=problem.far, **frame)
+    settings = dr.RenderSettings(height=48, width=48, antialias=True)
+    shift, step = np.array([0.3, -0.2, 0.5]), 1e-2
+
+    def truth(steps):
+        params = np.append(np.zeros(10), steps * step * shift)
+        return reference.reference_image(problem, params)
+
+    @jax.jit
+    def image(shift):
+        scene, _ = scene_of(problem)(jnp.zeros(13).at[10:].set(shift))
+        return dr.render(scene, camera, settings)
+
+    ours, moved = jax.jvp(image, (jnp.zeros(3),), (jnp.asarray(shift, jnp.float32),))
+    assert np.abs(ours - truth(0)).mean() < 1e-4
+    change = (truth(1) - truth(-1)) / (2 * step)
+    fields = reference.adjoint_fields(48)
+    got, want = (np.einsum("fhwc,hwc->f", fields, x) for x in (moved, change))
+    print(np.linalg.norm(got-want)/np.linalg.norm(want),np.abs(ours - truth(0)).mean())
+    assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
+
+
 def errors(name, **options):
     """Relative errors of the projected derivatives and of the L2 gradient, by parameter group."""
     problem = reference.SCENES[name]()

@@ -14,7 +14,7 @@ from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Method, Shader, View, apply_linear, collect, linear_zeros
-from diffrast.edges.pieces import to_pixels
+from diffrast.edges.pieces import scale_by_depth, to_pixels
 
 CREASES = ("none", "seams", "all")
 
@@ -130,13 +130,16 @@ def antialias_image(
     """Give an image its edges, in value and in derivative, and cut off its border of one pixel.
 
     Args:
-        view: what is drawn, and the image without edges.
+        view: what is drawn, and the image without edges; its `scale` is found here.
         shader: see `Method`.
         cull_backfaces: whether only front faces are drawn.
     """
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = max(4096, 1024 * math.ceil(height * width / 8 / 1024))
     method = Method(shader, cull_backfaces, capacity)
+    scale = scale_by_depth(lax.stop_gradient(view.positions_clip))
+    positions_clip = view.positions_clip * scale[:, None]
+    view = view._replace(positions_clip=positions_clip, scale=scale)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
 
     def with_edges(image: Array, found: Blended) -> Array:

@@ -62,6 +62,7 @@ class View(NamedTuple):
     image: Float[Array, "height_with_border width_with_border channels"]
     background: Float[Array, "*size channels"]  # one colour, or a picture like `image`
     scene: Any  # passed on to the shader
+    scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
 
 
 class Method(NamedTuple):
@@ -239,6 +240,11 @@ def _shade(
     """Colours of points on faces, several of each piece at once."""
     assert method.shader is not None
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
+    if view.scale is not None:
+        scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
+        barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
+        total = barycentrics[0] + barycentrics[1] + barycentrics[2]
+        barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
     colors = jnp.stack(method.shader(view.scene, face, barycentrics), axis=-1)
     return jnp.split(colors, len(points))
 

@@ -57,6 +57,23 @@ def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> F
     return jnp.stack([(x + w) * (width / 2), (w - y) * (height / 2), z, w])
 
 
+def scale_by_depth(positions_clip: Float[Array, "V 4"]) -> Float[Array, " V"]:
+    """Factors of homogeneous coordinates that make 1/w tell what is nearer: 1 under perspective.
+
+    A parallel projection has the same w everywhere. With these factors, which move nothing on the
+    screen, its 1/w grows from 1 to 2 (times as much) from the farthest vertex to the nearest; on a
+    plane it stays linear on the screen.
+    """
+    z, w = positions_clip[:, 2], positions_clip[:, 3]
+    finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
+    parallel = jnp.all((w == jnp.max(jnp.where(finite, w, -jnp.inf))) | ~finite)
+    nearest = jnp.min(jnp.where(finite, z, jnp.inf))
+    depth = jnp.max(jnp.where(finite, z, -jnp.inf)) - nearest
+    known = parallel & (depth > 0) & finite
+    far = jnp.where(known, z - nearest, 0) / jnp.where(known, depth, 1)
+    return jnp.where(known, 1 / (2 - far), 1)
+
+
 def facing(pixels: Float[Array, "4 V"], faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     """Volume det(v0, v1, v2) of x, y, w: negative on front faces, as y points down.
 

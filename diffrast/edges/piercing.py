@@ -89,7 +89,7 @@ def keep_near_crossings(
     bodies: Int[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> tuple[Int[Array, " pixels"], Int[Array, ""]]:
-    """Of chosen pixels those round which the planes of the two bodies' faces change places."""
+    """Of chosen pixels those round which the planes of two bodies' faces change places."""
     width = face_image.shape[1] - 2
 
     def step(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -99,15 +99,16 @@ def keep_near_crossings(
         row, column = number // width, number % width
         face = stored(pixels_round(face_image, column, row))
         body = stored(jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1))
-        one, other = stored(_two_bodies(body))
-        pair = jnp.stack([picked(face, one), picked(face, other)])[:, None]
-        corner = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])[:, :, None] * _WINDOW
-        x, y = jnp.stack([column, row])[:, None] + 0.5 + corner
-        _, depth = edge_values(corners_of(pair, faces, pixels), x, y)
-        apart = depth[0] - depth[1]
-        known = jnp.all(depth != -1, axis=(0, 1))
-        changes = ~(jnp.all(apart > 0, axis=0) | jnp.all(apart < 0, axis=0))
-        keep = (slots < count) & (~known | changes)
+        corner = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])[:, None, :, None] * _WINDOW
+        x, y = jnp.stack([column, row])[:, None, None] + 0.5 + corner
+        _, depth = edge_values(corners_of(face, faces, pixels)[:, :, :, None], x, y)
+        one, other = np.array(list(itertools.combinations(range(9), 2))).T
+        apart = stored(depth)[one] - depth[other]
+        unknown = jnp.any(depth == -1, axis=1)
+        changes = ~(jnp.all(apart > 0, axis=1) | jnp.all(apart < 0, axis=1))
+        differ = (body[one] >= 0) & (body[other] >= 0) & (body[one] != body[other])
+        changes = jnp.any(differ & (changes | unknown[one] | unknown[other]), axis=0)
+        keep = (slots < count) & changes
         slot = jnp.where(keep, total + jnp.cumsum(keep) - 1, order.shape[0])
         return kept.at[slot].set(number, mode="drop"), total + jnp.sum(keep)
 
