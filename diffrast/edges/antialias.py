@@ -137,7 +137,7 @@ def antialias_image(
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = max(4096, 1024 * math.ceil(height * width / 8 / 1024))
     method = Method(shader, cull_backfaces, capacity)
-    scale = scale_by_depth(lax.stop_gradient(view.positions_clip))
+    scale = scale_by_depth(view.positions_clip)
     positions_clip = view.positions_clip * scale[:, None]
     view = view._replace(positions_clip=positions_clip, scale=scale)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
