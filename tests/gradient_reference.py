@@ -477,7 +477,7 @@ def shadow_lamp() -> Problem:
     """A smooth ball over a floor, both near a lamp; it turns about a point outside of it."""
     ball = _object(dr.shapes.icosphere(3), DULL, 0.42, (0.3, 0.5, 0.2), (0.3, 0.1, 0.2))
     ball = replace(ball, pivot=ball.pivot + np.array([-0.5, 0.3, 0.4]))
-    return _shadowed(ball, {"type": "point", "position": (1.3, 2.1, 0.9)}, floor_size=3.4)
+    return _shadowed(ball, {"type": "point", "position": (1.3, 2.1, 0.9)}, floor_size=2.9)
 
 
 def shadow_spot() -> Problem:
