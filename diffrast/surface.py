@@ -62,7 +62,8 @@ def cast_outlines(
         weight.append(not isinstance(light, DirectionalLight))
     edge = outlines(scene.lights, shadows, geometry, topology, points, reached)
     clip = jnp.stack(source)
-    return Cast(edge, clip, jnp.array(weight, clip.dtype))
+    lit = jnp.stack([part > 0 for part in reached if part is not None])
+    return Cast(edge, lit, clip, jnp.array(weight, clip.dtype))
 
 
 def receive_shadows(world: World, points: Points) -> Reached:

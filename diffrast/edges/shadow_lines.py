@@ -19,7 +19,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast._topology import Topology
@@ -44,8 +44,9 @@ class Cast(NamedTuple):
     """The shadows of a scene, by their lights."""
 
     edge: Int[Array, "lights 2 height_with_border width_with_border"]
-    # Edge opposite to a corner, 3 * face + corner, whose shadow passes between a pixel and the one
-    # on its right, or below it; -1 if there is none.
+    # 3 * face + corner: the edge of the face opposite to the corner, whose shadow passes between a
+    # pixel and the one on its right, or below it; -1 if there is none.
+    lit: Bool[Array, "lights height_with_border width_with_border"]
     source: Float[Array, "lights 4"]  # clip position
     weight: Float[Array, " lights"]  # 1 for places, 0 for directions
 
@@ -58,26 +59,28 @@ class _Plane(NamedTuple):
 class Outlines(NamedTuple):
     """Lines that may part pixels: one for each pair of neighbours, shape (12, n)."""
 
-    exists: Array
+    exists: Bool[Array, "12 n"]
     face: Int[Array, " n"]  # on which the shadows fall
     corners: Float[Array, "3 3 n"]  # of it, from the pixel's centre
     vertices: Int[Array, "2 12 n"]  # of the edge
     ends: Float[Array, "2 3 12 n"]  # of the edge, from the pixel's centre
     source: Float[Array, "3 n"]  # the light, likewise
     weight: Float[Array, " n"]  # and its h
-    lit_on_right: Array
+    lit_on_right: Bool[Array, "12 n"]
+    centre_is_lit: Bool[Array, " n"]  # in the image
     range: Float[Array, "2 12 n"]  # begin and end along the line, from the point next to the centre
 
 
 class Shadow(NamedTuple):
     """One line in each of n pixels."""
 
-    used: Array
+    used: Bool[Array, " n"]
     face: Int[Array, " n"]  # on which it lies,
     barycentrics: Columns  # and where its middle does
     look: Int[Array, "2 n"]  # 0 to 8: pixels on the right and on the left
-    lit_on_right: Array
-    centre_on_right: Array
+    lit_on_right: Bool[Array, " n"]
+    centre_on_right: Bool[Array, " n"]
+    wrong_side: Bool[Array, " n"]  # the image has the centre on the other side of the line
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
     vertices: Int[Array, "3 2 n"]  # start and end of the edge; the face's corners; the light
@@ -99,7 +102,7 @@ def cross_shadows(
     light: Int[Array, " n"],
     column_of_light: Int[Array, " n"],
     pixel: Int[Array, "2 n"],
-    exists: Array,
+    exists: Bool[Array, " n"],
     cast: Cast,
     faces: Int[Array, "F 3"],
     pixels: Table,
@@ -123,8 +126,8 @@ def cross_shadows(
     valid = exists & (edge >= 0) & (own >= 0) & patch & ~again
 
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
-    vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in range(3)]))
-    behind, *ends = (place(vertex) for vertex in vertices)
+    vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in (1, 2)]))
+    ends = [place(vertex) for vertex in vertices]
     corners = place(faces.T[:, jnp.maximum(own, 0)])
     source = place(column_of_light)
     weight = cast.weight[light]
@@ -133,9 +136,9 @@ def cross_shadows(
     shadow = _shadow_plane(source, weight, *ends)
     line = _meet(ground, shadow)
     normal, foot, steep = stored(_normal_form(line, ground, shadow))
-    inwards = ground.offset * _dot(shadow.normal, behind - ends[0])
-    valid = valid & steep & (inwards != 0)
-    lit_on_right = inwards < 0
+    second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
+    lit_on_right = second_on_right != cast.lit[light, row, column]
+    valid = valid & steep
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
@@ -166,11 +169,12 @@ def cross_shadows(
         exists=chosen & (low < high),
         face=own,
         corners=corners,
-        vertices=vertices[1:],
+        vertices=vertices,
         ends=jnp.stack(ends),
         source=source,
         weight=weight,
         lit_on_right=lit_on_right,
+        centre_is_lit=cast.lit[light, pixel[1] + 1, pixel[0] + 1],
         range=_REACH * (2 * jnp.stack([low, high]) - 1),
     )
 
@@ -200,6 +204,8 @@ def shadow_of(
     low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
+    centre_on_right = _dot(foot, normal) < 0
+    alone = jnp.sum(outlines.exists, axis=0) == 1
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
@@ -228,15 +234,17 @@ def shadow_of(
 
     # Of the two neighbours between which it passes one is on its right.
     looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
-    height = (looks % 3 - 1) * normal[0] + (looks // 3 - 1) * normal[1]
-    look = jnp.where(height[0] > height[1], looks, looks[::-1])
+    step = looks[1] - looks[0]
+    second_on_right = jnp.where(step == 1, normal[0], normal[1]) > 0
+    look = jnp.where(second_on_right, looks[::-1], looks)
     return Shadow(
         used=used,
         face=outlines.face,
         barycentrics=barycentrics(e),
         look=look,
         lit_on_right=lit_on_right,
-        centre_on_right=_dot(foot, normal) < 0,
+        centre_on_right=centre_on_right,
+        wrong_side=alone & ((lit_on_right == centre_on_right) != outlines.centre_is_lit),
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
         vertices=jnp.stack(vertices).reshape(3, 2, -1),
