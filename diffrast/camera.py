@@ -304,6 +304,11 @@ def _world_to_clip(camera: Camera, positions_world: Array) -> Array:
     return apply_matrix(camera.projection, positions_eye)
 
 
+def direction_to_clip(camera: Camera, direction: Float[Array, "*batch 3"]) -> Array:
+    """Clip positions (..., 4) of the points at infinity in world directions (..., 3)."""
+    return apply_matrix(camera.projection[:, :3], apply_matrix(camera.view[:3, :3], direction))
+
+
 def clip_to_pixel(
     positions_clip: ArrayInput, *, height: int, width: int
 ) -> Float[Array, "*batch 3"]:

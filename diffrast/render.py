@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from diffrast._stored import assemble, stored
 from diffrast.camera import Camera
-from diffrast.edges import Shader, View, antialias_image
+from diffrast.edges import Glow, Shader, View, antialias_image
 from diffrast.geometry import (
     Points,
     apart_edges,
@@ -29,7 +29,8 @@ from diffrast.light import Columns, casts_shadow, normalize_columns
 from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
-from diffrast.surface import SHADERS, World, cast_shadows, receive_shadows
+from diffrast.shadows import Reached, terminators
+from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 
 
 class Buffers(NamedTuple):
@@ -106,7 +107,7 @@ def render(
     if settings.antialias:
         with jax.named_scope("edges"):
             image = assemble(stored(color))
-            image = _with_edges(image, world, clip, pixels, background, settings)
+            image = _with_edges(image, world, clip, pixels, reached, background, settings)
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]
@@ -162,6 +163,7 @@ def _with_edges(
     world: World,
     positions_clip: Array,
     pixels: Points,
+    reached: Reached,
     background: Array,
     settings: RenderSettings,
 ) -> Array:
@@ -169,20 +171,25 @@ def _with_edges(
     topology = scene_topology(world.scene)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
+    apart = apart_edges(geometry, topology.edges, settings.shading)
+    if world.shadows is not None:
+        apart = apart | terminators(world.scene.lights, world.shadows, geometry, topology.edges)
     view = View(
         positions_clip=positions_clip,
         faces=geometry.faces,
         turned=geometry.faces_outward[:, 0] != geometry.faces[:, 0],
         topology=topology,
-        apart=apart_edges(geometry, topology.edges, settings.shading),
+        apart=apart,
         face_image=pixels.face,
         image=image,
         background=background,
         scene=world,
+        cast=cast_outlines(world, topology, pixels, reached),
     )
     return antialias_image(
         view,
         shader=_shade_points(settings.shading),
+        glow=_glow_at(settings.shading),
         cull_backfaces=settings.cull_backfaces,
     )
 
@@ -191,6 +198,13 @@ def _shade_points(shading: str) -> Shader:
     def shade(world: World, face: Array, at: Columns) -> Columns:
         points = Points(face, at, jnp.zeros_like(at[0]))
         return SHADERS[shading](world, points, receive_shadows(world, points))
+
+    return shade
+
+
+def _glow_at(shading: str) -> Glow:
+    def shade(world: World, light: Array, face: Array, at: Columns) -> Columns:
+        return glow(shading, world, light, Points(face, at, jnp.zeros_like(at[0])))
 
     return shade
 

@@ -1,16 +1,22 @@
 """The colours of points on faces, one function a kind of shading."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrast.camera import Camera, viewpoint
+from diffrast._topology import Topology
+from diffrast.camera import Camera, direction_to_clip, viewpoint, world_to_clip
+from diffrast.edges import Cast
 from diffrast.geometry import Geometry, Points, at_points, flat_normals
 from diffrast.light import (
     AmbientLight,
     Columns,
+    DirectionalLight,
     Light,
     casts_shadow,
     normalize_columns,
@@ -18,7 +24,7 @@ from diffrast.light import (
 )
 from diffrast.scene import Scene
 from diffrast.shade import Reflectance, Surface, needs, phong
-from diffrast.shadows import Reached, Shadows, cast, receive
+from diffrast.shadows import Reached, Shadows, cast, outlines, receive
 
 
 class World(NamedTuple):
@@ -40,11 +46,46 @@ def cast_shadows(
     return World(scene, camera, geometry, shadows), reached
 
 
+def cast_outlines(
+    world: World, topology: Topology, points: Points, reached: Reached
+) -> Cast | None:
+    """The outlines of shadows between the pixels of an image; None without shadows."""
+    scene, camera, geometry, shadows = world
+    if shadows is None:
+        return None
+    source, weight = [], []
+    for light in filter(casts_shadow, scene.lights):
+        if isinstance(light, DirectionalLight):
+            source.append(direction_to_clip(camera, light.direction))
+        else:
+            source.append(world_to_clip(camera, light.position))
+        weight.append(not isinstance(light, DirectionalLight))
+    edge = outlines(scene.lights, shadows, geometry, topology, points, reached)
+    clip = jnp.stack(source)
+    return Cast(edge, clip, jnp.array(weight, clip.dtype))
+
+
 def receive_shadows(world: World, points: Points) -> Reached:
     """Which lights reach points."""
     if world.shadows is None:
         return (None,) * len(world.scene.lights)
     return receive(world.scene.lights, world.shadows, world.geometry, points)
+
+
+def glow(shading: str, world: World, light: Array, points: Points) -> Columns:
+    """What one light adds to the colours of points that it reaches.
+
+    Which light may differ from point to point: `light` counts those that cast shadows.
+    """
+    colors: list[Array] | None = None
+    for i, own in enumerate(filter(casts_shadow, world.scene.lights)):
+        alone = replace(world.scene, lights=(without_ambient(own),))
+        lit = SHADERS[shading](world._replace(scene=alone, shadows=None), points, (None,))
+        colors = (
+            lit if colors is None else jax.tree.map(partial(jnp.where, light == i), lit, colors)
+        )
+    assert colors is not None
+    return colors
 
 
 def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:

@@ -8,12 +8,15 @@ call, so are differences of images: `gradient_reference` makes derivatives of th
 
 Faces are clipped at the near and far planes, so that every corner left has w > 0. Depth along a
 line is compared by 1/w, which is affine on the screen (by -z_ndc under parallel projection).
+A light with "shadow": True casts hard shadows, whose ends `box_shadow` finds on every line.
 Conventions and shading are those of `reference`.
 """
 
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from box_shadow import Runs, Shadow, apart, expand, facing
 from reference import _at_faces, _shader, clip_polygon, shade, towards_viewer
 
 NEAR_FAR = np.array([[0.0, 0, 1, 1], [0, 0, -1, 1]])
@@ -60,7 +63,8 @@ def render_box(
 
     Args:
         positions_world, normals, faces, view, projection: geometry and camera.
-        lights, material, background, height, width, shading, specular, cull_backfaces: as there.
+        lights, material, background, height, width, shading, specular, cull_backfaces: as there,
+            but lights may also have "shadow": True.
         lines: lines of integration a row of pixels, one at a random height in each stratum.
         nodes: of Gauss's rule in each interval that has one face in one pixel.
         piercing: whether faces may intersect each other; without it an interval is given to the
@@ -74,39 +78,58 @@ def render_box(
     clip_from_world = np.asarray(projection, np.float64) @ np.asarray(view, np.float64)
     positions_clip = np.pad(positions, ((0, 0), (0, 1)), constant_values=1) @ clip_from_world.T
 
-    def light_points(points, normals, face) -> np.ndarray:
-        to_viewer = towards_viewer(clip_from_world, points)
-        return shade(points, normals, to_viewer, lights, _at_faces(material, face), specular)
-
     if upright:  # the image mirrored about its diagonal
         positions_clip = positions_clip[:, [1, 0, 2, 3]] * [-1, -1, 1, 1]
         height, width = width, height
-    color_at = _shader(positions[faces], np.asarray(normals, float)[faces], shading, light_points)
-    weights = _weights(positions_clip[faces], height, width)
+    weights = pixel_weights(positions_clip[faces], height, width)
     pieces = _pieces(positions_clip[faces], weights, height, width, cull_backfaces, upright)
     y = _line_heights(height, lines, seed)
 
+    corners, corner_normals = positions[faces], np.asarray(normals, float)[faces]
+
+    def colors_of(lights, casting=False) -> Callable[..., np.ndarray]:
+        def light_points(points, normals, face) -> np.ndarray:
+            to_viewer = towards_viewer(clip_from_world, points)
+            color = shade(points, normals, to_viewer, lights, _at_faces(material, face), specular)
+            return color * facing(lights[0], corners, face, normals)[:, None] if casting else color
+
+        return _shader(corners, corner_normals, shading, light_points)
+
+    everywhere, casting = apart(lights)
+    layers = [(colors_of(everywhere), lambda runs: runs)]
+    for light in casting:
+        layers.append((colors_of([light], True), Shadow(light, corners, weights, y).lit))
     image = np.zeros((3, height * width))
     gauss, gauss_weights = np.polynomial.legendre.leggauss(nodes)
     rule = (gauss + 1) / 2, gauss_weights / (2 * lines)
-    for rows, start, end, face in _visible_runs(pieces, y, width, piercing):
-        pixel = rows // lines * width + np.minimum((start + end) / 2, width - 0.5).astype(int)
-        empty = face < 0
-        bare = np.bincount(pixel[empty], (end - start)[empty], height * width) / lines
-        image += np.asarray(background, float)[:, None] * bare
-        seen = np.flatnonzero(~empty)
-        for some in np.array_split(seen, -(-len(seen) * nodes // NODES_AT_ONCE) or 1):
-            length = (end - start)[some, None]
-            x = (start[some, None] + length * rule[0]).ravel()
-            index = np.repeat(face[some], nodes)
-            a, b, c = np.moveaxis(weights[index], -1, 0)
-            s = a * x[:, None] + b * np.repeat(y[rows[some]], nodes)[:, None] + c
-            colors = color_at(index, s / s.sum(axis=-1, keepdims=True))
-            colors = np.einsum("nkc,nk->cn", colors.reshape(-1, nodes, 3), length * rule[1])
-            for channel in range(3):
-                image[channel] += np.bincount(pixel[some], colors[channel], height * width)
+    for found in _visible_runs(pieces, y, width, piercing):
+        empty = found.face < 0
+        bare = Runs(*(column[empty] for column in found))
+        area = np.bincount(_pixels(bare, lines, width), bare.end - bare.start, height * width)
+        image += np.asarray(background, float)[:, None] * (area / lines)
+        seen = Runs(*(column[~empty] for column in found))
+        for color_at, shone_at in layers:
+            shone = shone_at(seen)
+            pixel = _pixels(shone, lines, width)
+            count = len(pixel)
+            for some in np.array_split(np.arange(count), -(-count * nodes // NODES_AT_ONCE) or 1):
+                line, start, end, face = (column[some] for column in shone)
+                length = (end - start)[:, None]
+                x = (start[:, None] + length * rule[0]).ravel()
+                index = np.repeat(face, nodes)
+                a, b, c = np.moveaxis(weights[index], -1, 0)
+                s = a * x[:, None] + b * np.repeat(y[line], nodes)[:, None] + c
+                colors = color_at(index, s / s.sum(axis=-1, keepdims=True))
+                colors = np.einsum("nkc,nk->cn", colors.reshape(-1, nodes, 3), length * rule[1])
+                for channel in range(3):
+                    image[channel] += np.bincount(pixel[some], colors[channel], height * width)
     image = np.moveaxis(image.reshape(3, height, width), 0, -1)
     return (np.swapaxes(image, 0, 1) if upright else image).copy()
+
+
+def _pixels(runs, lines, width) -> np.ndarray:
+    column = np.minimum((runs.start + runs.end) / 2, width - 0.5).astype(int)
+    return runs.line // lines * width + column
 
 
 def _line_heights(height, lines, seed) -> np.ndarray:
@@ -116,7 +139,7 @@ def _line_heights(height, lines, seed) -> np.ndarray:
     return (np.arange(height * lines) + jitter) / lines
 
 
-def _weights(corners_clip, height, width) -> np.ndarray:
+def pixel_weights(corners_clip, height, width) -> np.ndarray:
     """Barycentrics over w of faces (F, 3, 4) by pixel coordinates (x, y, 1): (F, 3, 3).
 
     Faces seen exactly edge-on have zeros.
@@ -159,8 +182,8 @@ def _pieces(corners_clip, weights, height, width, cull_backfaces, mirrored) -> _
     return _Pieces(screen[inside], nearness[inside], face[inside])
 
 
-def _visible_runs(pieces, y, width, piercing):
-    """Yield (line, start, end, face) of runs of one face, -1 for none, in one pixel, by batches."""
+def _visible_runs(pieces, y, width, piercing) -> Iterator[Runs]:
+    """Yield runs of one face, -1 for none, in one pixel, by batches."""
     first = np.searchsorted(y, pieces.corners[:, 0, 1], "left")
     last = np.searchsorted(y, pieces.corners[:, 2, 1], "left")
     active = np.cumsum(np.bincount(first, minlength=len(y) + 1))
@@ -170,17 +193,11 @@ def _visible_runs(pieces, y, width, piercing):
         begin, stop = lines[0], lines[-1] + 1
         index = np.flatnonzero((first < stop) & (last > begin))
         low = np.maximum(first[index], begin)
-        owner, offset = _expand(np.minimum(last[index], stop) - low)
+        owner, offset = expand(np.minimum(last[index], stop) - low)
         yield _batch(pieces, index[owner], low[owner] + offset, lines, y, width, piercing)
 
 
-def _expand(counts) -> tuple[np.ndarray, np.ndarray]:
-    """Count to each of `counts`: the entry and the number within it."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-
-
-def _batch(pieces, index, line, lines, y, width, piercing) -> tuple[np.ndarray, ...]:
+def _batch(pieces, index, line, lines, y, width, piercing) -> Runs:
     """Resolve the spans of pieces `index` on `line`, for the lines `lines`."""
     start, end = _span_ends(pieces.corners[index], y[line])
     start, end = np.maximum(start, 0.0), np.minimum(end, width)
@@ -210,7 +227,7 @@ def _batch(pieces, index, line, lines, y, width, piercing) -> tuple[np.ndarray, 
     # The nearest face in the middle of each interval.
     middle = (left + right) / 2
     low = rank[: len(index)]
-    owner, offset = _expand(np.maximum(rank[len(index) : 2 * len(index)] - low, 0))
+    owner, offset = expand(np.maximum(rank[len(index) : 2 * len(index)] - low, 0))
     interval = low[owner] + offset
     near = slope[owner] * middle[interval] + level[owner]
     best = np.full(len(middle), -np.inf)
@@ -226,7 +243,7 @@ def _batch(pieces, index, line, lines, y, width, piercing) -> tuple[np.ndarray, 
     new = (np.diff(row) != 0) | (np.diff(cell) != 0) | (np.diff(face) != 0)
     opens = np.concatenate([[True], new]) if len(row) else new
     closes = np.concatenate([new, [True]]) if len(row) else new
-    return row[opens] + lines[0], left[opens], right[closes], face[opens]
+    return Runs(row[opens] + lines[0], left[opens], right[closes], face[opens])
 
 
 def _span_ends(corners, y) -> tuple[np.ndarray, np.ndarray]:
@@ -250,7 +267,7 @@ def _crossings(base, start, end, slope, level) -> np.ndarray:
     base, start, end, slope, level = (v[order] for v in (base, start, end, slope, level))
     after = np.arange(len(base)) + 1
     counts = np.maximum(np.searchsorted(base + start, base + end, "left") - after, 0)
-    i, offset = _expand(counts)
+    i, offset = expand(counts)
     j = after[i] + offset
     with np.errstate(divide="ignore", invalid="ignore"):
         x = (level[j] - level[i]) / (slope[i] - slope[j])

@@ -1,17 +1,17 @@
 """Reference derivatives of images under a box filter, and the scenes that they belong to.
 
 `reference_jacobian` differentiates `box_filter.render_box` by central differences, with one step
-of Richardson's extrapolation, for the 13 numbers that `moved` explains: camera and first object.
-Projections of the Jacobians on smooth random fields are stored in data/gradients.npz; running this
-file makes them again:
+of Richardson's extrapolation, for the 13 numbers that `moved` explains, camera and first object,
+and where a light casts shadows for the 7 of `moved_lights`. Projections of the Jacobians on smooth
+random fields are stored in data/gradients.npz; running this file makes them again:
 
     python tests/gradient_reference.py [--scenes cubes,sphere] [--size 96]
     python tests/gradient_reference.py --check cubes
 
-For a scene NAME the file holds `NAME/projections` (16, 13), the sums over pixels and channels of
-`adjoint_fields` times the Jacobian; `NAME/target_image_params` (13,), a motion by 1.5 pixels or
-so; and `NAME/l2_gradient` (13,), the gradient at rest of half the sum of squared differences to
-the image after that motion.
+For a scene NAME of P = 13 or 20 parameters the file holds `NAME/projections` (16, P), the sums
+over pixels and channels of `adjoint_fields` times the Jacobian; `NAME/target_image_params` (P,), a
+motion by 1.5 pixels or so; and `NAME/l2_gradient` (P,), the gradient at rest of half the sum of
+squared differences to the image after that motion.
 """
 
 import argparse
@@ -22,18 +22,30 @@ from pathlib import Path
 
 import numpy as np
 from box_filter import render_box
-from reference import look_at, orthographic, perspective
+from box_shadow import source
+from reference import look_at, normalize, orthographic, perspective
 
 import diffrast as dr
 
 STORE = Path(__file__).parent / "data" / "gradients.npz"
 PARAMETERS = 13
+LIGHT_PARAMETERS = 7
 GROUPS = {
     "rotation": slice(0, 3),
     "translation": slice(3, 6),
     "fov": slice(6, 7),
     "object rotation": slice(7, 10),
     "object translation": slice(10, 13),
+}
+LIGHT_GROUPS = {
+    "light position": slice(13, 16),
+    "light direction": slice(16, 19),
+    "light cutoff": slice(19, 20),
+}
+LIGHT_GROUPS_OF = {
+    "directional": ["light direction"],
+    "point": ["light position"],
+    "spot": list(LIGHT_GROUPS),
 }
 STEP = 0.1  # pixels
 SEED = 20240611
@@ -55,9 +67,11 @@ class Object:
 
 @dataclass(frozen=True)
 class Problem:
-    """A scene to differentiate: plain NumPy. `lights` are as in `reference.render_phong`.
+    """A scene to differentiate: plain NumPy. `lights` are as in `box_filter.render_box`.
 
-    `piercing` tells that faces intersect; `nodes` is the order of `render_box`'s integration.
+    Shadows of object 0 on the plane of the last object are what steps of the first light that
+    casts any are measured by. `piercing` tells that faces intersect; `nodes` is the order of
+    `render_box`'s integration.
     """
 
     objects: list[Object]
@@ -114,7 +128,7 @@ def so3_exp(w) -> np.ndarray:
 
 
 def moved(problem, params=None) -> tuple:
-    """Return (positions, normals, faces, view, projection, material) for 13 parameters.
+    """Return (positions, normals, faces, view, projection, material) for the first 13 parameters.
 
     Positions and normals are in world space, material values have one entry a face. The view is
     T(translation) @ R(so3_exp(rotation)) @ look_at(eye, target, up), and object 0 is turned about
@@ -157,15 +171,59 @@ def moved(problem, params=None) -> tuple:
     return *parts, view, projection, material
 
 
+def caster(problem) -> int | None:
+    """Which light is the first to cast shadows."""
+    return next((k for k, light in enumerate(problem.lights) if light.get("shadow")), None)
+
+
+def parameters(problem) -> int:
+    return PARAMETERS if caster(problem) is None else PARAMETERS + LIGHT_PARAMETERS
+
+
+def groups(problem) -> dict[str, slice]:
+    """The groups of parameters that have an effect."""
+    number = caster(problem)
+    names = [] if number is None else LIGHT_GROUPS_OF[problem.lights[number]["type"]]
+    return GROUPS | {name: LIGHT_GROUPS[name] for name in names}
+
+
+def moved_lights(problem, params=None) -> list[dict]:
+    """Return the lights, the first that casts shadows moved by parameters 13 to 19.
+
+    Those that mean nothing for a light have no effect. The parameters are
+
+        13:16  translation of the light, in world axes
+        16:19  rotation vector of its direction, in world axes
+        19     change of log(cutoff).
+    """
+    lights, number = list(problem.lights), caster(problem)
+    if params is None or number is None:
+        return lights
+    light = dict(lights[number])
+    if light["type"] != "directional":
+        light["position"] = np.asarray(light["position"], float) + params[13:16]
+    if light["type"] != "point":
+        light["direction"] = so3_exp(params[16:19]) @ np.asarray(light["direction"], float)
+    if light["type"] == "spot":
+        light["cutoff"] = light["cutoff"] * np.exp(params[19])
+    lights[number] = light
+    return lights
+
+
 def pixels_moved(problem, params) -> float:
-    """Root mean square motion in pixels of those surface points in the image that move at all."""
-    here, there = _surface_pixels(problem, np.zeros(PARAMETERS)), _surface_pixels(problem, params)
+    """Root mean square motion in pixels of those points in the image that move at all.
+
+    The points are some of all surfaces, of the shadow of object 0 on the plane of the last object,
+    and of the rim of a spot light's cone on that plane. None may move: zero.
+    """
+    here, there = (_points_in_pixels(problem, p) for p in (np.zeros(parameters(problem)), params))
     inside = np.all((here > 0) & (here < problem.size) & np.isfinite(there), axis=1)
     distance = np.linalg.norm((there - here)[inside], axis=1)
-    return float(np.sqrt(np.mean(distance[distance > 0] ** 2)))
+    moving = distance[distance > 0]
+    return float(np.sqrt(np.mean(moving**2))) if len(moving) else 0.0
 
 
-def _surface_pixels(problem, params) -> np.ndarray:
+def _points_in_pixels(problem, params) -> np.ndarray:
     """Points scattered over all faces, hidden ones too, in pixels; NaN behind the near plane."""
     positions, _, faces, view, projection, _ = moved(problem, params)
     random = np.random.default_rng(SEED)
@@ -176,9 +234,35 @@ def _surface_pixels(problem, params) -> np.ndarray:
     )
     weights = random.dirichlet(np.ones(3), size=len(chosen))
     points = np.einsum("nk,nkc->nc", weights, positions[faces[chosen]])
-    clip = np.pad(points, ((0, 0), (0, 1)), constant_values=1) @ (projection @ view).T
+    points = np.pad(points, ((0, 0), (0, 1)), constant_values=1)
+    if caster(problem) is not None:
+        light = moved_lights(problem, params)[caster(problem)]
+        plane = positions[faces[-1]]
+        shades = _shadow_points(light, points[chosen < counts[0]], plane)
+        points = np.concatenate([points, shades])
+    clip = points @ (projection @ view).T
     w = np.where(clip[:, 3:] > problem.near, clip[:, 3:], np.nan)
     return (clip[:, :2] / w * [1, -1] + 1) * problem.size / 2
+
+
+def _shadow_points(light, points, corners) -> np.ndarray:
+    """Shadows (N, 4) of homogeneous points, and of a cone's rim, on the plane of three corners.
+
+    NaN where they are none, as the point is behind the light or the ray leads away from the plane.
+    """
+    if light["type"] == "spot":
+        along = normalize(np.asarray(light["direction"], float))
+        side = normalize(np.cross(along, np.eye(3)[np.argmin(np.abs(along))]))
+        across = side, np.cross(along, side)
+        around = np.linspace(0, 2 * np.pi, 256, endpoint=False)[:, None]
+        outwards = np.cos(around) * across[0] + np.sin(around) * across[1]
+        rim = along + np.tan(light["cutoff"]) * outwards
+        points = np.concatenate([points, np.pad(rim, ((0, 0), (0, 1)))])
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    plane, place = np.append(normal, -normal @ corners[0]), source(light)
+    plane = plane * np.sign(plane @ place)
+    shades = (plane @ place) * points - (points @ plane)[:, None] * place
+    return shades / np.where(shades[:, 3:] > 0, shades[:, 3:], np.nan)
 
 
 # Images and derivatives.
@@ -216,7 +300,7 @@ def _render(problem, params, lines, upright) -> np.ndarray:
         faces,
         view,
         projection,
-        lights=problem.lights,
+        lights=moved_lights(problem, params),
         material=material,
         background=problem.background,
         height=problem.size,
@@ -231,20 +315,22 @@ def _render(problem, params, lines, upright) -> np.ndarray:
 
 
 def step_sizes(problem) -> np.ndarray:
-    """For each parameter the change that moves things by one pixel."""
+    """For each parameter the change that moves things by one pixel, zero if there is none."""
     tiny = 1e-6
-    return np.array([tiny / pixels_moved(problem, tiny * axis) for axis in np.eye(PARAMETERS)])
+    pixels = [pixels_moved(problem, tiny * axis) for axis in np.eye(parameters(problem))]
+    return np.array([tiny / moved if moved else 0.0 for moved in pixels])
 
 
 def reference_jacobian(problem, lines=32, step=STEP) -> np.ndarray:
-    """Return the derivatives (13, H, W, 3) of the image at rest.
+    """Return the derivatives (P, H, W, 3) of the image at rest.
 
     Central differences D over `step` pixels and twice as many give (4 D(step) - D(2 step)) / 3.
     """
-
     levelness = _levelness(reference_image(problem, lines=lines))
 
     def difference(change) -> np.ndarray:
+        if not np.any(change):
+            return np.zeros((problem.size, problem.size, 3))
         ahead, behind = (reference_image(problem, s * change, lines, levelness) for s in (1, -1))
         return (ahead - behind) / (2 * np.linalg.norm(change))
 
@@ -266,14 +352,14 @@ def adjoint_fields(size=96, count=16) -> np.ndarray:
 
 
 def project(jacobian) -> np.ndarray:
-    """Sums over pixels and channels of the fields times the Jacobian: (16, 13)."""
+    """Sums over pixels and channels of the fields times the Jacobian: (16, P)."""
     return np.einsum("fhwc,phwc->fp", adjoint_fields(jacobian.shape[1]), jacobian, optimize=True)
 
 
 def target_params(problem) -> np.ndarray:
-    """Return a random motion (13,) by 1.5 pixels, to which each parameter adds as much."""
-    params = np.random.default_rng(SEED + 1).choice([-1.0, 1.0], PARAMETERS) * step_sizes(problem)
-    params *= 0.4
+    """Return a random motion (P,) by 1.5 pixels, to which each parameter adds as much."""
+    steps = step_sizes(problem)
+    params = 0.4 * np.random.default_rng(SEED + 1).choice([-1.0, 1.0], len(steps)) * steps
     for _ in range(4):
         params *= 1.5 / pixels_moved(problem, params)
     return params
@@ -365,6 +451,51 @@ def crease() -> Problem:
     return Problem([ball], eye=eye, target=target, fov_y=0.6, shading="flat")
 
 
+SHADE = {
+    "shadow": True,
+    "ambient": (0.1, 0.1, 0.1),
+    "diffuse": (0.8, 0.75, 0.7),
+    "specular": (0.3, 0.3, 0.3),
+}
+# So dull that facets near the terminator, which turn dark at once, do not show.
+DULL = WARM | {"diffuse": (0.06, 0.04, 0.03), "specular": (0.0, 0.0, 0.0)}
+
+
+def _shadowed(thing, light, floor_size=9.0, **camera) -> Problem:
+    """A problem of an object above a slanted floor, in ambient light and one light with shadows."""
+    floor = _object(
+        dr.shapes.plane(floor_size, floor_size), COLD, 1.0, (-1.5, 0.06, 0.04), (0.0, -0.9, 0.0)
+    )
+    view = {"eye": (0.5, 3.0, 4.6), "target": (-0.1, -0.4, 0.0), "fov_y": 0.6} | camera
+    return Problem([thing, floor], lights=[LIGHTS[0], SHADE | light], **view)
+
+
+def shadow_sun() -> Problem:
+    """A cube over a floor, in the sun."""
+    box = _object(dr.shapes.cube(), WARM, 0.45, (0.3, 0.5, 0.2), (0.35, 0.25, 0.1))
+    return _shadowed(box, {"type": "directional", "direction": (-0.65, -1.0, -0.15)})
+
+
+def shadow_lamp() -> Problem:
+    """A smooth ball over a floor, both near a lamp; it turns about a point outside of it."""
+    ball = _object(dr.shapes.icosphere(3), DULL, 0.42, (0.3, 0.5, 0.2), (0.3, 0.1, 0.2))
+    ball = replace(ball, pivot=ball.pivot + np.array([-0.5, 0.3, 0.4]))
+    return _shadowed(ball, {"type": "point", "position": (1.3, 2.1, 0.9)}, floor_size=2.9)
+
+
+def shadow_spot() -> Problem:
+    """A cube over a floor, in the cone of a spot light that is partly in view."""
+    box = _object(dr.shapes.cube(), WARM, 0.35, (0.5, -0.4, 0.2), (0.25, 0.1, 0.1))
+    place = {"position": (1.2, 2.3, 0.8), "direction": (-1.25, -2.9, -0.8), "cutoff": 0.42}
+    return _shadowed(box, {"type": "spot", **place})
+
+
+def shadow_hidden() -> Problem:
+    """The shadow of a cube that is not in the image."""
+    box = _object(dr.shapes.cube(), WARM, 0.55, (0.3, 0.5, 0.2), (2.7, 1.85, 0.4))
+    return _shadowed(box, {"type": "directional", "direction": (-0.95, -1.0, -0.15)})
+
+
 SCENES: dict[str, Callable[[], Problem]] = {
     "cubes": cubes,
     "sphere": sphere,
@@ -376,6 +507,10 @@ SCENES: dict[str, Callable[[], Problem]] = {
     "piercing": piercing,
     "border": border,
     "crease": crease,
+    "shadow_sun": shadow_sun,
+    "shadow_lamp": shadow_lamp,
+    "shadow_spot": shadow_spot,
+    "shadow_hidden": shadow_hidden,
 }
 
 
@@ -415,7 +550,7 @@ def check(problem) -> None:
     steps = step_sizes(problem)
     whole = np.linalg.norm(base * steps)
     for what, other in others.items():
-        for group, part in GROUPS.items():
+        for group, part in groups(problem).items():
             error = np.linalg.norm((other - base)[:, part]) / np.linalg.norm(other[:, part])
             share = np.linalg.norm(((other - base) * steps)[:, part]) / whole
             print(f"  {what:16} {group:19} {error:.2e}, of all groups {share:.2e}", flush=True)

@@ -115,7 +115,7 @@ def test_no_piece_is_lost_however_few_records_there_are(seen):
 
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
-        method = Method(None, False, capacity)
+        method = Method(None, None, False, capacity)
         found = collect(view, method)
 
         def change(points, colors):

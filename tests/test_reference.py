@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import reference
+from box_filter import pixel_weights, render_box
+from box_shadow import Runs, Shadow, apart, facing
 
 FOV = 0.9
 EYE = (0.0, 0.0, 4.0)
@@ -262,3 +264,107 @@ def test_bands_do_not_show(monkeypatch):
     whole = render_square(lights, samples=3)
     monkeypatch.setattr(reference, "SAMPLES_AT_ONCE", 100)
     np.testing.assert_array_equal(render_square(lights, samples=3), whole)
+
+
+# Hard shadows under the box filter.
+
+SHADOW_COLORS = {
+    "ambient": (0.1, 0.1, 0.2),
+    "diffuse": (0.7, 0.6, 0.5),
+    "specular": (0.3, 0.3, 0.3),
+}
+ABOVE = {"position": (2.2, 2.5, 1.0), "direction": (-2.2, -3.2, -1.3), "cutoff": 0.6}
+CASTING = {
+    "directional": {"type": "directional", "direction": (-0.8, -1.0, 0.3)},
+    "point": {"type": "point", "position": ABOVE["position"]},
+    "spot": {"type": "spot", **ABOVE},
+}
+
+
+def ball_over_floor():
+    """Positions, normals, faces and camera of a coarse ball above a square, slightly tilted."""
+    ball, ball_faces = sphere(5, 8)
+    floor = (SQUARE * 2.5)[:, [0, 2, 1]] * [1, 1, -1] + np.array([0, -1, 0])
+    positions = np.concatenate([0.6 * ball, floor + 0.1 * floor[:, :1] * [0, 1, 0]])
+    normals = np.concatenate([ball, np.tile(reference.normalize(np.array([-0.1, 1, 0])), (4, 1))])
+    faces = np.concatenate([ball_faces, SQUARE_FACES + len(ball)])
+    view = reference.look_at((1.5, 2.5, 4.5), (0, -0.4, 0), (0.1, 1, 0))
+    return positions, normals, faces, view, reference.perspective(0.7, 1.0, 0.1, 50)
+
+
+def sampled(lights, samples, shading, size=48):
+    """What `samples` x `samples` rays a pixel see, each lit or not as `reference.lit` says."""
+    positions, normals, faces, view, projection = ball_over_floor()
+    clip = to_clip(positions, view, projection)
+    fragments = reference.rasterize(clip, faces, size, size, samples=samples)
+    seen = fragments.face >= 0
+    face, barycentrics = fragments.face[seen], fragments.barycentrics[seen]
+    points, normal = (
+        np.einsum("nk,nkc->nc", barycentrics, values[faces[face]])
+        for values in (positions, normals)
+    )
+    if shading == "flat":
+        a, b, c = np.moveaxis(positions[faces[face]], 1, 0)
+        normal = np.cross(b - a, c - a)
+    normal = reference.normalize(normal)
+    to_viewer = reference.towards_viewer(projection @ view, points)
+    everywhere, casting = apart(lights)
+    color = reference.shade(points, normal, to_viewer, everywhere, WHITE)
+    for light in casting:
+        lit = reference.lit(light, points, face, normal, positions, faces)
+        color += lit[:, None] * reference.shade(points, normal, to_viewer, [light], WHITE)
+    image = np.full((*seen.shape, 3), 0.3)
+    image[seen] = color
+    return image.reshape(size, samples, size, samples, 3).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(
+    ("kinds", "shading"), [(["directional", "point"], "phong"), (["spot"], "flat")]
+)
+def test_box_filtered_shadows_equal_rays(kinds, shading, upright):
+    positions, normals, faces, view, projection = ball_over_floor()
+    lights = [CASTING[kind] | SHADOW_COLORS | {"shadow": True} for kind in kinds]
+    plain = [light | {"shadow": False} for light in lights]
+    lights.append({"type": "ambient", "ambient": (0.1, 0.2, 0.1)})
+
+    def box(lights):
+        return render_box(
+            positions, normals, faces, view, projection, lights=lights, material=WHITE,
+            background=(0.3, 0.3, 0.3), height=48, width=48, lines=16, shading=shading,
+            upright=upright,
+        )  # fmt: skip
+
+    image = box(lights)
+    errors = [np.abs(image - sampled(lights, samples, shading)) for samples in (3, 9)]
+    assert np.mean(np.abs(image - box([*plain, lights[-1]]))) > 0.02
+    assert errors[1].max() < 0.05
+    assert errors[1].mean() < 0.0005
+    assert errors[1].mean() < errors[0].mean() / 3
+
+
+@pytest.mark.parametrize("kind", CASTING)
+def test_lit_parts_of_lines_equal_rays(kind):
+    light, size, tiny = CASTING[kind], 150, 1e-7
+    positions, _, faces, view, projection = ball_over_floor()
+    clip = to_clip(positions, view, projection)
+    fragments = reference.rasterize(clip, faces, size, size, offset=(0.31, 0.77))
+    seen = fragments.face >= 0
+    face, barycentrics = fragments.face[seen], fragments.barycentrics[seen]
+    points = np.einsum("nk,nkc->nc", barycentrics, positions[faces[face]])
+    row, column = np.nonzero(seen)
+    runs = Runs(row, column + 0.31 - tiny, column + 0.31 + tiny, face)
+    weights = pixel_weights(clip[faces], size, size)
+    found = Shadow(light, positions[faces], weights, np.arange(size) + 0.77).lit(runs)
+    got = np.zeros(seen.shape, bool)
+    got[found.line, found.start.astype(int)] = True
+
+    a, b, c = np.moveaxis(positions[faces[face]], 1, 0)
+    normal = np.cross(b - a, c - a)
+    got = got[seen] & facing(light, positions[faces], face, normal)
+    if kind == "spot":
+        to_light = reference.normalize(np.array(light["position"]) - points)
+        got &= reference.spot_fade(light, to_light) > 0
+    want = reference.lit(light, points, face, normal, positions, faces)
+    assert 0.2 < want.mean() < 0.9
+    np.testing.assert_array_equal(got, want)

@@ -13,7 +13,16 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import Blended, Method, Shader, View, apply_linear, collect, linear_zeros
+from diffrast.edges.blend import (
+    Blended,
+    Glow,
+    Method,
+    Shader,
+    View,
+    apply_linear,
+    collect,
+    linear_zeros,
+)
 from diffrast.edges.pieces import scale_by_depth, to_pixels
 
 CREASES = ("none", "seams", "all")
@@ -125,20 +134,23 @@ def _by_columns(shader: PointShader) -> Shader:
 
 
 def antialias_image(
-    view: View, *, shader: Shader | None, cull_backfaces: bool
+    view: View, *, shader: Shader | None, glow: Glow | None = None, cull_backfaces: bool
 ) -> Float[Array, "height width channels"]:
     """Give an image its edges, in value and in derivative, and cut off its border of one pixel.
 
     Args:
         view: what is drawn, and the image without edges; its `scale` is found here.
         shader: see `Method`.
+        glow: likewise; needed if the view has shadows.
         cull_backfaces: whether only front faces are drawn.
     """
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = max(4096, 1024 * math.ceil(height * width / 8 / 1024))
-    method = Method(shader, cull_backfaces, capacity)
-    scale = scale_by_depth(lax.stop_gradient(view.positions_clip))
+    method = Method(shader, glow, cull_backfaces, capacity)
+    scale = scale_by_depth(view.positions_clip)
     positions_clip = view.positions_clip * scale[:, None]
+    if view.cast is not None:
+        positions_clip = jnp.concatenate([positions_clip, view.cast.source])
     view = view._replace(positions_clip=positions_clip, scale=scale)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
 

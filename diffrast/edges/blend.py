@@ -42,12 +42,15 @@ from diffrast.edges.piercing import (
     keep_near_crossings,
     line_of,
 )
+from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
+from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look
 
 _ROWS_AT_ONCE = 1024
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 
 Shader = Callable[[Any, Array, list[Array]], list[Array]]
+Glow = Callable[[Any, Array, Array, list[Array]], list[Array]]
 
 
 class View(NamedTuple):
@@ -63,6 +66,7 @@ class View(NamedTuple):
     background: Float[Array, "*size channels"]  # one colour, or a picture like `image`
     scene: Any  # passed on to the shader
     scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
+    cast: Cast | None = None  # shadows; then the last of `positions_clip` are the lights
 
 
 class Method(NamedTuple):
@@ -71,11 +75,13 @@ class Method(NamedTuple):
     Attributes:
         shader: colours of points on faces, `shader(scene, face, barycentrics)`; None takes the
             colours of pixels beside the edge instead.
+        glow: what one light adds to the colours, `glow(scene, light, face, barycentrics)`.
         cull_backfaces: whether only front faces are drawn.
         capacity: rows of the records.
     """
 
     shader: Shader | None
+    glow: Glow | None
     cull_backfaces: bool
     capacity: int
 
@@ -188,10 +194,19 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
     nothing = _nothing(view, method, edge_count & 0)
     blended = lax.fori_loop(0, chunks, add_edges, nothing)
-    bodies = view.topology.bodies
-    if bodies is None:
-        return blended
+    if view.topology.bodies is not None:
+        blended = _add_piercing(blended, view, method, pixels, volume, first)
+    if view.cast is not None:
+        blended = _add_shadows(blended, view, view.cast, method, pixels, first)
+    return blended
 
+
+def _add_piercing(
+    total: Blended, view: View, method: Method, pixels: Array, volume: Array, first: ArrayLike
+) -> Blended:
+    """Add the lines along which surfaces pierce each other."""
+    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    assert bodies is not None
     order, pixel_count = keep_near_crossings(
         *choose_pixels(view.face_image, bodies), view.faces, pixels, bodies, view.face_image
     )
@@ -204,13 +219,42 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
 
         def add_lines(n: Array, total: Blended) -> Blended:
-            return _with_lines(total, view, method, pixel, line_of(crossings, n, pixel), first)
+            return _with_line(total, view, method, pixel, line_of(crossings, n, pixel), first)
 
         most = jnp.max(jnp.sum(crossings.exists, axis=0))
         return lax.fori_loop(0, most, add_lines, total)
 
     chunks = (pixel_count + PIXELS_AT_ONCE - 1) // PIXELS_AT_ONCE
-    return lax.fori_loop(0, chunks, add_pixels, blended)
+    return lax.fori_loop(0, chunks, add_pixels, total)
+
+
+def _add_shadows(
+    total: Blended, view: View, cast: Cast, method: Method, pixels: Array, first: ArrayLike
+) -> Blended:
+    """Add the outlines of shadows."""
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    order, count = choose_shadowed(cast)
+
+    def add_pixels(n: Array, total: Blended) -> Blended:
+        slots = n * PIXELS_AT_ONCE + jnp.arange(PIXELS_AT_ONCE)
+        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+        pixel = jnp.stack([number % width, number // width % height])
+        light = number // (width * height)
+        column = pixels.shape[1] - cast.weight.size + light
+        exists = slots < count
+        outlines = cross_shadows(
+            light, column, pixel, exists, cast, view.faces, pixels, view.topology, view.face_image
+        )
+
+        def add_lines(n: Array, total: Blended) -> Blended:
+            line = shadow_of(outlines, n, column, pixel, view.faces)
+            return _with_shadow(total, view, method, pixel, light, line, first)
+
+        most = jnp.max(jnp.sum(outlines.exists, axis=0))
+        return lax.fori_loop(0, most, add_lines, total)
+
+    chunks = (count + PIXELS_AT_ONCE - 1) // PIXELS_AT_ONCE
+    return lax.fori_loop(0, chunks, add_pixels, total)
 
 
 def _nothing(view: View, method: Method, zero: Array) -> Blended:
@@ -308,10 +352,10 @@ def _with_pieces(
     return total._replace(records=_with_rows(total.records, used, rows, first))
 
 
-def _with_lines(
+def _with_line(
     total: Blended, view: View, method: Method, pixel: Array, line: Line, first: ArrayLike
 ) -> Blended:
-    """Add lines where surfaces pierce each other, as three rows each: two corners in every row."""
+    """Add one line in each pixel where surfaces pierce each other."""
     area = _area(line.begin, line.end)
     places = [_place(view, pixel, look) for look in line.look]
     if method.shader is None:
@@ -323,18 +367,59 @@ def _with_lines(
     value = area[:, None] * jump
     total, own = _with_values(total, view, pixel, line.used, value, jnp.stack([right, left]))
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
+    motion = line.motion.reshape(3, 6, -1)
+    records = _with_lines(total.records, line.used, own, places, jump, area, corners, motion, first)
+    return total._replace(records=records)
+
+
+def _with_shadow(
+    total: Blended,
+    view: View,
+    method: Method,
+    pixel: Array,
+    light: Array,
+    line: Shadow,
+    first: ArrayLike,
+) -> Blended:
+    """Add one line in each pixel across which a light begins."""
+    assert method.glow is not None
+    area = _area(line.begin, line.end)
+    glow = jnp.stack(method.glow(view.scene, light, line.face, line.barycentrics), axis=-1)
+    jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
+    own = view.image.reshape(-1, view.image.shape[2])[_place(view, pixel, 4)]
+    other = own + jnp.where(line.centre_on_right, -1, 1)[:, None] * jump
+    held = jnp.stack([own, other])
+    total, number = _with_values(total, view, pixel, line.used, area[:, None] * jump, held)
+    places = [_place(view, pixel, look) for look in line.look]
+    records = _with_lines(
+        total.records, line.used, number, places, jump, area, line.vertices, line.motion, first
+    )
+    return total._replace(records=records)
+
+
+def _with_lines(
+    records: Records,
+    used: Array,
+    pixel: Array,
+    places: list[Array],
+    jump: Array,
+    area: Array,
+    vertices: Array,
+    motion: Array,
+    first: ArrayLike,
+) -> Records:
+    """Record lines that move with six vertices, as three rows each: two vertices in every row."""
     rows = [
         (
-            jnp.stack([own, places[1], places[0], places[0], *corners[i]], axis=-1),
+            jnp.stack([pixel, places[1], places[0], places[0], *vertices[i]], axis=-1),
             jump,
             jnp.stack([area * (i == 0), jnp.zeros_like(area)], axis=-1),
-            stored(line.motion.reshape(3, 6, -1)[i].T),
+            stored(motion[i].T),
         )
         for i in range(3)
     ]
     joined = tuple(jnp.concatenate(column) for column in zip(*rows, strict=True))
-    used = jnp.tile(line.used, 3)
-    return total._replace(records=_with_rows(total.records, used, joined, first))
+    return _with_rows(records, jnp.tile(used, 3), joined, first)
 
 
 def _with_values(

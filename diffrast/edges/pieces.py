@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
@@ -62,13 +62,14 @@ def scale_by_depth(positions_clip: Float[Array, "V 4"]) -> Float[Array, " V"]:
 
     A parallel projection has the same w everywhere. With these factors, which move nothing on the
     screen, its 1/w grows from 1 to 2 (times as much) from the farthest vertex to the nearest; on a
-    plane it stays linear on the screen.
+    plane it stays linear on the screen. Differentiable in z.
     """
     z, w = positions_clip[:, 2], positions_clip[:, 3]
     finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
     parallel = jnp.all((w == jnp.max(jnp.where(finite, w, -jnp.inf))) | ~finite)
-    nearest = jnp.min(jnp.where(finite, z, jnp.inf))
-    depth = jnp.max(jnp.where(finite, z, -jnp.inf)) - nearest
+    fixed = lax.stop_gradient(z)
+    nearest = jnp.min(jnp.where(finite, fixed, jnp.inf))
+    depth = jnp.max(jnp.where(finite, fixed, -jnp.inf)) - nearest
     known = parallel & (depth > 0) & finite
     far = jnp.where(known, z - nearest, 0) / jnp.where(known, depth, 1)
     return jnp.where(known, 1 / (2 - far), 1)

@@ -28,6 +28,17 @@ def edge_values(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
     1/w is -1 on faces seen edge-on. Multiplied by what they add up to, barycentric coordinates
     become the values, up to one sign.
     """
+    e, volume = edge_functions(corners, x, y)
+    sign = jnp.where(volume < 0, -1, 1)
+    depth = jnp.where(volume == 0, -1, (e[0] + e[1] + e[2]) / jnp.where(volume == 0, 1, volume))
+    return stored(([value * sign for value in e], depth))
+
+
+def edge_functions(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
+    """Three values of one sign inside of faces, and the volume det(x, y, w), which has that sign.
+
+    The value of a corner belongs to the edge opposite to it.
+    """
     w = corners[2]
     u, v = corners[0] - x * w, corners[1] - y * w
     e = [
@@ -35,10 +46,7 @@ def edge_values(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
         u[2] * v[0] - u[0] * v[2],
         u[0] * v[1] - u[1] * v[0],
     ]
-    volume = e[0] * w[0] + e[1] * w[1] + e[2] * w[2]
-    sign = jnp.where(volume < 0, -1, 1)
-    depth = jnp.where(volume == 0, -1, (e[0] + e[1] + e[2]) / jnp.where(volume == 0, 1, volume))
-    return stored(([value * sign for value in e], depth))
+    return e, e[0] * w[0] + e[1] * w[1] + e[2] * w[2]
 
 
 def covers(values: Columns) -> Bool[Array, "*n"]:

@@ -4,17 +4,17 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from diffrast._stored import stored
+from diffrast._topology import Edges
 from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, ShiningLight, casts_shadow
-from diffrast.linalg import dot
-from diffrast.mesh import face_normals
-from diffrast.shadows.lit import Rays, lit
+from diffrast.shadows.lit import Rays, lit, turned_to
 from diffrast.shadows.maps import Pictures, Plan, plan, take
-from diffrast.shadows.views import LightView, Seen, is_parallel, light_view, see, sides
+from diffrast.shadows.views import LightView, Seen, light_view, see, sides, source
 
 Reached: TypeAlias = tuple[Array | None, ...]  # by each light: 1 at points it reaches, or 0
 
@@ -58,7 +58,7 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
             strict=True,
         )
         pictures = []
-        for size, members in _by_resolution(casting):
+        for size, members in by_resolution(casting):
             joined = zip(*(plans[i] for i in members), strict=True)
             together = Plan(*(jnp.concatenate(column) for column in joined))
             pictures.append(take(together, geometry, size))
@@ -81,7 +81,21 @@ def receive(
         return _reached(lights, shadows, geometry, points, regards)
 
 
-def _by_resolution(lights: list[ShiningLight]) -> list[tuple[int, list[int]]]:
+def terminators(
+    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, edges: Edges
+) -> Bool[Array, " edges"]:
+    """Edges between a face that is turned to a light with shadows and one that is not."""
+    lights, geometry = lax.stop_gradient((lights, geometry))
+    casting = [light for light in lights if casts_shadow(light)]
+    found = jnp.zeros_like(edges.seam)
+    for light, view in zip(casting, shadows.views, strict=True):
+        turned = turned_to(source(light, view), geometry, np.arange(geometry.faces.shape[0]))
+        one, other = turned[jnp.maximum(edges.faces, 0)].T
+        found = found | (one != other)
+    return found & (edges.faces[:, 1] >= 0)
+
+
+def by_resolution(lights: list[ShiningLight]) -> list[tuple[int, list[int]]]:
     """Resolutions in ascending order, each with the numbers of its lights."""
     sizes = [light.shadow.resolution for light in lights if light.shadow is not None]
     return [(size, [i for i, s in enumerate(sizes) if s == size]) for size in sorted(set(sizes))]
@@ -95,7 +109,7 @@ def _regards(
     regards = []
     for light, view in zip(lights, views, strict=True):
         seen = stored(see(light, view, position))
-        turned = _turned_to(light, view, geometry)
+        turned = turned_to(source(light, view), geometry, np.arange(geometry.faces.shape[0]))
         regards.append(_Regard(seen, seen.inside & turned[visible] & (points.face >= 0)))
     return regards
 
@@ -112,7 +126,7 @@ def _reached(
     reached: dict[int, Array] = {}
     face, shape = jnp.ravel(points.face), points.face.shape
     barycentrics = jnp.stack([jnp.ravel(b) for b in points.barycentrics])
-    for pictures, (_, members) in zip(shadows.pictures, _by_resolution(casting), strict=True):
+    for pictures, (_, members) in zip(shadows.pictures, by_resolution(casting), strict=True):
         parts, first = [], 0
         for i in members:
             seen, asked = regards[i]
@@ -130,14 +144,3 @@ def _reached(
         reached.update(zip(members, bright, strict=True))
     numbers = iter(range(len(casting)))
     return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)
-
-
-def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " F"]:
-    """Whether the light is on that side of faces which the normals at their corners point to."""
-    normal = face_normals(geometry.positions, geometry.faces_outward)
-    corner = geometry.positions[geometry.faces_outward[:, 0]]
-    to_light = -view.axes[2] if is_parallel(light) else view.origin - corner
-    inside_out = jnp.zeros(normal.shape[0], bool)
-    if geometry.normals is not None:
-        inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces], axis=1)) < 0
-    return jnp.where(inside_out, -1, 1) * dot(normal, to_light) > 0

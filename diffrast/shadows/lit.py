@@ -12,11 +12,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
+from diffrast.linalg import dot
+from diffrast.mesh import face_normals
 from diffrast.raster.fixed_point import CULLED, group_by_class
 from diffrast.shadows.maps import Pictures
 
@@ -67,6 +70,20 @@ def lit(pictures: Pictures, geometry: Geometry, rays: Rays) -> Float[Array, " n"
     return lax.fori_loop(0, chunks, look_closer, bright).astype(key.dtype)
 
 
+def turned_to(source: Array, geometry: Geometry, face: ArrayLike) -> Bool[Array, " n"]:
+    """Whether a light is on that side of faces which the normals at their corners point to.
+
+    `source` is the light as a homogeneous point, (4,), or one for each face, (n, 4).
+    """
+    normal = face_normals(geometry.positions, geometry.faces_outward[face])
+    corner = geometry.positions[geometry.faces_outward[face, 0]]
+    to_light = source[..., :3] - source[..., 3:] * corner
+    inside_out = jnp.zeros(normal.shape[0], bool)
+    if geometry.normals is not None:
+        inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces[face]], axis=1)) < 0
+    return jnp.where(inside_out, -1, 1) * dot(normal, to_light) > 0
+
+
 def _texel_of(pictures: Pictures, rays: Rays) -> _Texel:
     last = pictures.face.shape[1] - 1
     column, row = (jnp.clip(jnp.floor(at), 0, last).astype(jnp.int32) for at in (rays.x, rays.y))
@@ -82,6 +99,20 @@ def _at_texels(values: Array, picture: Array, texel: _Texel) -> Array:
 
 def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, " n"]:
     """Whether faces near the rays from points to the light stop them."""
+    around, own, others, stops = stopping(pictures, geometry, rays)
+    found = jnp.max(stops, axis=0) > 0
+    nearest = others[:, :, 4]
+    return found | _hidden_by_small(pictures, rays, _texel_of(pictures, rays), around, own, nearest)
+
+
+def stopping(
+    pictures: Pictures, geometry: Geometry, rays: Rays
+) -> tuple[Int[Array, "9 n"], Array, Array, Float[Array, "9 n"]]:
+    """Faces at the 3×3 texels round points, and which of them stop the rays to the light.
+
+    The faces; the corners of the points' own faces and of these, x, y and z by rows; and numbers
+    that are positive for faces that stop a ray.
+    """
     texel = _texel_of(pictures, rays)
     last = pictures.face.shape[1] - 1
     nine = jnp.arange(9)[:, None]
@@ -104,8 +135,7 @@ def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, 
     ray, corners = stored((ray, (others - origin[:, None, None]) - point[:, None, None]))
     stops = _stops(corners, ray[:, None], endless=source[3] == 0)
     foreign = (around >= 0) & (around != rays.face)
-    found = jnp.max(jnp.where(foreign, stops, -1), axis=0) > 0
-    return found | _hidden_by_small(pictures, rays, texel, around, own, others[:, :, 4])
+    return around, own, others, jnp.where(foreign, stops, -1)
 
 
 def _hidden_by_small(

@@ -1,0 +1,320 @@
+"""Outlines of shadows: lines along which a light's shadow planes meet the faces that are seen.
+
+A light and an edge span a plane, and where it meets the plane of a face the shadow of the edge
+falls on that face: along a straight line on the screen. It is cut to one pixel and, at a corner of
+the outline, where the next line begins; then it parts areas as an edge of a mesh does.
+
+With h the weight of points, 1 for places and 0 for directions, (x, y, w, h) are coordinates of
+space for a perspective camera, which drops h. The plane of a face is (r, r'), r · (x, y, w) + r' h
+= 0, and that of the shadow (p, p'); they meet on the screen where (r' p − p' r) · (x, y, 1) = 0.
+Where the corners of the shadow plane move, what it says of a point M = α light + β start + γ end
+changes by −p · (α dlight + β dstart + γ dend); and where those of the face do, the point seen at a
+place of the screen moves along the line of sight. A parallel projection drops another coordinate:
+its shadows have no lines yet.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from diffrast._stored import stored
+from diffrast._topology import Topology
+from diffrast.edges.neighborhood import first_row
+from diffrast.edges.pieces import positive_part
+from diffrast.edges.planes import Columns, Table, barycentrics, edge_functions
+from diffrast.raster.fixed_point import CULLED, group_by_class
+
+_REACH = 0.75  # pixels from the centre: farther than the corners
+_ROUNDINGS = 64  # in a line's coefficients
+_OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
+
+# Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
+_RIGHT = [(0, 3 * row + k, 3 * row + k + 1) for row, k in itertools.product(range(3), range(2))]
+_BELOW = [(1, 3 * row + k, 3 * row + k + 3) for row, k in itertools.product(range(2), range(3))]
+_DIRECTION, _FIRST, _SECOND = np.array(
+    sorted(_RIGHT + _BELOW, key=lambda pair: 4 not in pair[1:])
+).T
+
+
+class Cast(NamedTuple):
+    """The shadows of a scene, by their lights."""
+
+    edge: Int[Array, "lights 2 height_with_border width_with_border"]
+    # Edge opposite to a corner, 3 * face + corner, whose shadow passes between a pixel and the one
+    # on its right, or below it; -1 if there is none.
+    source: Float[Array, "lights 4"]  # clip position
+    weight: Float[Array, " lights"]  # 1 for places, 0 for directions
+
+
+class _Plane(NamedTuple):
+    normal: Float[Array, "3 *n"]  # of x, y and w
+    offset: Float[Array, "*n"]  # of h
+
+
+class Outlines(NamedTuple):
+    """Lines that may part pixels: one for each pair of neighbours, shape (12, n)."""
+
+    exists: Array
+    face: Int[Array, " n"]  # on which the shadows fall
+    corners: Float[Array, "3 3 n"]  # of it, from the pixel's centre
+    vertices: Int[Array, "2 12 n"]  # of the edge
+    ends: Float[Array, "2 3 12 n"]  # of the edge, from the pixel's centre
+    source: Float[Array, "3 n"]  # the light, likewise
+    weight: Float[Array, " n"]  # and its h
+    lit_on_right: Array
+    range: Float[Array, "2 12 n"]  # begin and end along the line, from the point next to the centre
+
+
+class Shadow(NamedTuple):
+    """One line in each of n pixels."""
+
+    used: Array
+    face: Int[Array, " n"]  # on which it lies,
+    barycentrics: Columns  # and where its middle does
+    look: Int[Array, "2 n"]  # 0 to 8: pixels on the right and on the left
+    lit_on_right: Array
+    centre_on_right: Array
+    begin: Float[Array, "2 n"]  # ends, from the pixel's centre
+    end: Float[Array, "2 n"]
+    vertices: Int[Array, "3 2 n"]  # start and end of the edge; the face's corners; the light
+    motion: Float[Array, "3 6 n"]  # area on the right with x, y and w of these
+
+
+def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
+    """Indices (light, row, column) of pixels round which an outline passes, and how many."""
+    right, below = (cast.edge[:, k] >= 0 for k in range(2))
+    right = right[:, :-2] | right[:, 1:-1] | right[:, 2:]
+    below = below[:, :-2] | below[:, 1:-1]
+    right = right[:, :, :-2] | right[:, :, 1:-1]
+    below = below[:, :, :-2] | below[:, :, 1:-1] | below[:, :, 2:]
+    order, starts = group_by_class(jnp.where(right | below, 0, CULLED).reshape(-1))
+    return order, starts[1]
+
+
+def cross_shadows(
+    light: Int[Array, " n"],
+    column_of_light: Int[Array, " n"],
+    pixel: Int[Array, "2 n"],
+    exists: Array,
+    cast: Cast,
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+    topology: Topology,
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> Outlines:
+    """Find the lines at pixels (column, row); `column_of_light` is where `pixels` has the light."""
+    centre = pixel + 0.5
+
+    def place(vertex: Array) -> Array:
+        """x, y and w of vertices, from the pixel's centre."""
+        x, y, w = pixels[jnp.array([0, 1, 3])][:, vertex]
+        return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
+
+    row, column = pixel[1] + _FIRST[:, None] // 3, pixel[0] + _FIRST[:, None] % 3
+    edge = stored(cast.edge[light, _DIRECTION[:, None], row, column])
+    own = stored(face_image[pixel[1] + 1, pixel[0] + 1])
+    next_to = stored(face_image[row, column])
+    patch = topology.patches[jnp.maximum(next_to, 0)] == topology.patches[jnp.maximum(own, 0)]
+    again = jnp.any(edge[:, None] == jnp.where(jnp.tri(12, k=-1)[..., None] > 0, edge, -2), axis=1)
+    valid = exists & (edge >= 0) & (own >= 0) & patch & ~again
+
+    caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in range(3)]))
+    behind, *ends = (place(vertex) for vertex in vertices)
+    corners = place(faces.T[:, jnp.maximum(own, 0)])
+    source = place(column_of_light)
+    weight = cast.weight[light]
+
+    ground = _face_plane(corners)
+    shadow = _shadow_plane(source, weight, *ends)
+    line = _meet(ground, shadow)
+    normal, foot, steep = stored(_normal_form(line, ground, shadow))
+    inwards = ground.offset * _dot(shadow.normal, behind - ends[0])
+    valid = valid & steep & (inwards != 0)
+    lit_on_right = inwards < 0
+
+    # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
+    meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
+    linked = meets[0] | meets[1]
+    primary = valid & (jnp.arange(12)[:, None] == first_row(valid))
+    chosen = primary
+    for _ in range(2):
+        chosen = chosen | jnp.any(linked & chosen, axis=1)
+    outwards = jnp.where(lit_on_right, 1, -1) * normal
+    first = jnp.sum(jnp.where(primary, outwards, 0), axis=1)
+    chosen = chosen | (valid & (jnp.sum(outwards * first[:, None], axis=0) < _OPPOSITE))
+
+    along = _REACH * jnp.stack([-normal[1], normal[0]])
+    sign = jnp.where(ground.offset < 0, -1, 1)
+    limits = [sign * _meet(ground, _end_plane(source, weight, shadow, *e)) for e in _ways(ends)]
+    cut = [jnp.any(meet & chosen, axis=1) for meet in meets]
+
+    def inside(at: Array) -> list[Array]:
+        x, y = at
+        square = [0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y]
+        return square + [
+            jnp.where(is_cut, a * x + b * y + c, 1)
+            for is_cut, (a, b, c) in zip(cut, limits, strict=True)
+        ]
+
+    low, high = positive_part(inside(foot - along), inside(foot + along))
+    return Outlines(
+        exists=chosen & (low < high),
+        face=own,
+        corners=corners,
+        vertices=vertices[1:],
+        ends=jnp.stack(ends),
+        source=source,
+        weight=weight,
+        lit_on_right=lit_on_right,
+        range=_REACH * (2 * jnp.stack([low, high]) - 1),
+    )
+
+
+def shadow_of(
+    outlines: Outlines,
+    number: Array,
+    light: Int[Array, " n"],
+    pixel: Int[Array, "2 n"],
+    faces: Int[Array, "F 3"],
+) -> Shadow:
+    """The line with this number, 0 and up, in each pixel; `light` is its column in `pixels`."""
+    rank = jnp.cumsum(outlines.exists, axis=0) - 1
+    here = outlines.exists & (rank == number)
+    row = stored(jnp.minimum(first_row(here), 11))
+    used = jnp.any(here, axis=0)
+
+    def one(values: Array) -> Array:
+        return values[..., row, jnp.arange(row.size)]
+
+    start, end = stored((one(outlines.ends[0]), one(outlines.ends[1])))
+    source, weight = outlines.source, outlines.weight
+    ground, shadow = _face_plane(outlines.corners), _shadow_plane(source, weight, start, end)
+    line = _meet(ground, shadow)
+    normal, foot, _ = _normal_form(line, ground, shadow)
+    along = jnp.stack([-normal[1], normal[0]])
+    low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
+    x, y = middle = foot + (low + high) / 2 * along
+    lit_on_right = one(outlines.lit_on_right)
+
+    # The middle as a sum of light, start and end, and as one of the face's corners.
+    point = jnp.stack([x, y, jnp.ones_like(x)])
+    depth = -_dot(ground.normal, point) / _nonzero(ground.offset)
+    planes = [
+        _end_plane(source, weight, shadow, end, start),
+        _end_plane(source, weight, shadow, start, end),
+        _edge_plane(shadow, start, end),
+    ]
+    to_light = source - weight * start
+    at = [start - end, end - start, to_light]
+    shares = [
+        (_dot(plane.normal, point) + plane.offset * depth) / _nonzero(_dot(plane.normal, away))
+        for plane, away in zip(planes, at, strict=True)
+    ]
+    e, volume = edge_functions(outlines.corners, x, y)
+    steepness = jnp.hypot(line[0], line[1])
+    factor = (high - low) * ground.offset / _nonzero(steepness)
+    turn = factor * shadow.offset / _nonzero(ground.offset) / _nonzero(volume)
+    motions = [-factor * share * shadow.normal for share in shares]
+    corner_motions = [turn * value * ground.normal for value in e]
+    rows = [motions[:2], corner_motions[:2], [corner_motions[2], motions[2]]]
+    motion = jnp.stack([jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows])
+    corners = faces[outlines.face].T
+    vertices = [one(outlines.vertices[0]), one(outlines.vertices[1]), *corners, light]
+
+    # Of the two neighbours between which it passes one is on its right.
+    looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
+    height = (looks % 3 - 1) * normal[0] + (looks // 3 - 1) * normal[1]
+    look = jnp.where(height[0] > height[1], looks, looks[::-1])
+    return Shadow(
+        used=used,
+        face=outlines.face,
+        barycentrics=barycentrics(e),
+        look=look,
+        lit_on_right=lit_on_right,
+        centre_on_right=_dot(foot, normal) < 0,
+        begin=middle - (high - low) / 2 * along,
+        end=middle + (high - low) / 2 * along,
+        vertices=jnp.stack(vertices).reshape(3, 2, -1),
+        motion=jnp.where(used, motion, 0),
+    )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.sum(a * b, axis=0)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return jnp.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _nonzero(value: Array) -> Array:
+    return jnp.where(value == 0, 1, value)
+
+
+def _of_screen(motion: Array, pixel: Array) -> Array:
+    """By x, y and w of the screen what is given by those from a pixel's centre."""
+    x, y, w = motion
+    return jnp.stack([x, y, w - (pixel[0] + 0.5) * x - (pixel[1] + 0.5) * y])
+
+
+def _through(normal: Array, place: Array) -> _Plane:
+    """The plane through a place; its normal is scaled to a largest component of one."""
+    normal = stored(normal / _nonzero(jnp.max(jnp.abs(normal), axis=0)))
+    return _Plane(normal, -_dot(normal, place))
+
+
+def _face_plane(corners: Float[Array, "3 3 *n"]) -> _Plane:
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    return _through(_cross(b - a, c - a), a)
+
+
+def _shadow_plane(source: Array, weight: Array, start: Array, end: Array) -> _Plane:
+    to_light = source[:, None] - weight * start if start.ndim == 3 else source - weight * start
+    return _through(_cross(to_light, end - start), start)
+
+
+def _end_plane(source: Array, weight: Array, shadow: _Plane, start: Array, end: Array) -> _Plane:
+    """The plane through light and start at right angles to the shadow's; positive at the end."""
+    to_light = source[:, None] - weight * start if start.ndim == 3 else source - weight * start
+    plane = _through(_cross(shadow.normal, to_light), start)
+    sign = jnp.where(_dot(plane.normal, end - start) < 0, -1, 1)
+    return _Plane(sign * plane.normal, sign * plane.offset)
+
+
+def _edge_plane(shadow: _Plane, start: Array, end: Array) -> _Plane:
+    """The plane through the edge at right angles to the shadow's."""
+    return _through(_cross(end - start, shadow.normal), start)
+
+
+def _ways(ends: list[Array]) -> list[tuple[Array, Array]]:
+    return [(ends[0], ends[1]), (ends[1], ends[0])]
+
+
+def _meet(ground: _Plane, plane: _Plane) -> Float[Array, "3 *n"]:
+    """The line a x + b y + c = 0 on the screen where planes meet: (a, b, c)."""
+    normal = ground.normal[:, None] if plane.normal.ndim == 3 else ground.normal
+    return ground.offset * plane.normal - plane.offset * normal
+
+
+def _normal_form(line: Array, ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
+    """A line's unit normal and its point next to the pixel's centre; and whether it is known."""
+    steepness = jnp.hypot(line[0], line[1])
+    size = jnp.max(jnp.abs(shadow.normal[:2]), axis=0) * jnp.abs(ground.offset)
+    size = size + jnp.max(jnp.abs(ground.normal[:2]), axis=0) * jnp.abs(shadow.offset)
+    steep = steepness > _ROUNDINGS * jnp.finfo(line.dtype).eps * size
+    inverse = 1 / jnp.where(steep, steepness, 1)
+    normal = line[:2] * inverse
+    return normal, -line[2] * inverse * normal, steep
+
+
+def _same_place(end: Array, others: list[Array]) -> Array:
+    """Which ends (3, 12, n) are where others are, shape (12, 12, n); but for their own edges'."""
+    same = [jnp.all(end[:, :, None] == other[:, None], axis=0) for other in others]
+    return (same[0] | same[1]) & (jnp.eye(12)[..., None] == 0)

@@ -1,0 +1,229 @@
+"""The edges whose shadows pass between neighbouring pixels.
+
+Of two neighbouring pixels that show one surface one may be lit and the other hidden from the light
+by a face. Seen by the light, a straight line leads from the hidden point to the lit one: it is
+followed from that face to the next across their common edge, to where the surface ends or turns
+away from the light. This edge has the outline of the shadow that passes between the two pixels,
+whatever the size of faces and texels. Indices only: no derivatives.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+from diffrast._topology import Topology
+from diffrast.edges.neighborhood import first_row, picked
+from diffrast.edges.planes import Columns, edge_functions
+from diffrast.geometry import Geometry, Points
+from diffrast.light import Light, casts_shadow
+from diffrast.raster.fixed_point import CULLED, group_by_class
+from diffrast.shadows.cast import Reached, Shadows, by_resolution
+from diffrast.shadows.lit import Rays, stopping, turned_to
+from diffrast.shadows.maps import Pictures
+from diffrast.shadows.views import sides
+
+_AT_ONCE = 256
+_STEPS = 64  # from face to face
+
+
+class _Lamps(NamedTuple):
+    """The lights of some pictures."""
+
+    first: Int[np.ndarray, " lights"]  # picture of each
+    cube: Bool[np.ndarray, " lights"]  # six pictures, the sides of a cube
+
+
+def outlines(
+    lights: tuple[Light, ...],
+    shadows: Shadows,
+    geometry: Geometry,
+    topology: Topology,
+    points: Points,
+    reached: Reached,
+) -> Int[Array, "lights 2 height width"]:
+    """For each light with shadows and each pixel the edges between it and the next ones.
+
+    Args:
+        lights: of the scene.
+        shadows: of these lights.
+        geometry: of the scene.
+        topology: of its faces.
+        points: what each pixel sees.
+        reached: which lights reach it.
+
+    Returns:
+        3 * face + corner, the edge of a face opposite to a corner, or -1: between the pixel and
+        that on its right, and that below it.
+    """
+    casting = [light for light in lights if casts_shadow(light)]
+    bright = [part > 0 for part in reached if part is not None]
+    geometry, points = lax.stop_gradient((geometry, points))
+    found: dict[int, Array] = {}
+    with jax.named_scope("outlines"):
+        for pictures, (_, members) in zip(shadows.pictures, by_resolution(casting), strict=True):
+            counts = [sides(casting[i]) for i in members]
+            lamps = _Lamps(np.cumsum([0, *counts[:-1]]), np.array(counts) > 1)
+            lit = jnp.stack([bright[i] for i in members])
+            edges = _between_pixels(lamps, pictures, geometry, topology, points, lit)
+            found.update(zip(members, edges, strict=True))
+    return jnp.stack([found[i] for i in range(len(casting))])
+
+
+def _between_pixels(
+    lamps: _Lamps,
+    pictures: Pictures,
+    geometry: Geometry,
+    topology: Topology,
+    points: Points,
+    lit: Bool[Array, "lights height width"],
+) -> Int[Array, "lights 2 height width"]:
+    height, width = points.face.shape
+    patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
+
+    def differs(lit: Array) -> Array:
+        right = (lit[:, 1:] != lit[:, :-1]) & (patch[:, 1:] == patch[:, :-1])
+        below = (lit[1:] != lit[:-1]) & (patch[1:] == patch[:-1])
+        return jnp.stack([jnp.pad(right, ((0, 0), (0, 1))), jnp.pad(below, ((0, 1), (0, 0)))])
+
+    pairs = jax.vmap(differs)(lit)
+    order, starts = group_by_class(jnp.where(pairs, 0, CULLED).reshape(-1))
+    face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
+    barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
+
+    def look(n: Array, edges: Array) -> Array:
+        slots = n * _AT_ONCE + jnp.arange(_AT_ONCE)
+        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+        lamp, at = number // (2 * height * width), number % (height * width)
+        next_at = at + jnp.where(number // (height * width) % 2 == 0, 1, width)
+        is_lit = bright[lamp, at]
+        ends = jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
+        dark, bright_end = (Points(face[i], list(barycentrics[:, i]), at) for i in stored(ends))
+        edge = _edge_between(lamps, lamp, pictures, geometry, topology, dark, bright_end)
+        place = jnp.where(slots < starts[1], number, edges.size)
+        return edges.at[place].set(edge, mode="drop")
+
+    chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
+    none = jnp.full(pairs.size, -1, jnp.int32) + (starts[1] & 0)
+    return lax.fori_loop(0, chunks, look, none).reshape(pairs.shape)
+
+
+def _edge_between(
+    lamps: _Lamps,
+    lamp: Int[Array, " n"],
+    pictures: Pictures,
+    geometry: Geometry,
+    topology: Topology,
+    dark: Points,
+    bright: Points,
+) -> Int[Array, " n"]:
+    """The edge whose shadow passes between points in the dark and others in the light."""
+    table = geometry.positions.T
+
+    def corners_of(face: Array) -> Array:
+        """x, y and z of faces' corners, shape (3, 3 corners, *face)."""
+        return stored(table[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
+
+    def place(points: Points) -> Array:
+        return jnp.sum(corners_of(points.face) * jnp.stack(points.barycentrics), axis=1)
+
+    at_dark, at_bright = stored((place(dark), place(bright)))
+    picture = stored(_picture(lamps, lamp, at_dark - pictures.plan.origin[lamps.first][lamp].T))
+    origin = stored(pictures.plan.origin[picture].T)
+    matrix = stored(jnp.moveaxis(pictures.plan.matrix[picture][:, :3], 0, 2))  # (x y w, 4, n)
+
+    def seen(place: Array) -> Array:
+        """x, y and w in the light's picture of places (3, ..., n)."""
+        x, y, z = (place[i] - origin[i] for i in range(3))
+        return jnp.stack([r[0] * x + r[1] * y + r[2] * z + r[3] for r in matrix])
+
+    ends = []
+    for end in (at_dark, at_bright):
+        x, y, w = seen(end)
+        ends.append(stored([x / jnp.where(w > 0, w, 1), y / jnp.where(w > 0, w, 1)]))
+    zero = jnp.zeros_like(at_dark[0])
+    rays = Rays(
+        face=dark.face,
+        barycentrics=jnp.stack(dark.barycentrics),
+        picture=picture,
+        x=ends[0][0],
+        y=ends[0][1],
+        key=zero,
+        unit=zero,
+        asked=zero == 0,
+    )
+    around, _, _, stops = stopping(pictures, geometry, rays)
+    part, _, _ = _leaves(stored(seen(corners_of(around))), ends)
+    part = stored(jnp.where((stops > 0) & (part < 2), part, -1))
+    farthest = jnp.max(part, axis=0)
+    row = jnp.where(farthest >= 0, first_row(part == farthest), 4)
+    face = picked(around, row)
+    face = jnp.where(turned_to(pictures.plan.source[picture], geometry, dark.face), face, -1)
+    return _follow(face, topology.neighbors, lambda face: seen(corners_of(face)), ends)
+
+
+def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"]) -> Array:
+    """Which picture shows points, given from their lights."""
+    size = jnp.abs(offset)
+    first = (size[0] >= size[1]) & (size[0] >= size[2])
+    axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
+    side = 2 * axis + (picked(offset, axis) < 0)
+    return jnp.asarray(lamps.first)[lamp] + jnp.where(jnp.asarray(lamps.cube)[lamp], side, 0)
+
+
+def _leaves(
+    corners: Float[Array, "3 3 *n"], ends: list[Columns]
+) -> tuple[Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
+    """Where on the way between two points, 0 to 1, a face ends; 3 if it does not.
+
+    Also the corner opposite to the edge there, and the volume of the face, whose sign tells which
+    side it turns to the light.
+    """
+    (first, volume), (last, _) = (edge_functions(corners, *end) for end in ends)
+    sign = jnp.where(volume < 0, -1, 1)
+    parts = []
+    for a, b in zip(first, last, strict=True):
+        a, b = jnp.maximum(a * sign, 0), b * sign
+        parts.append(jnp.where(b < 0, a / jnp.where(b < 0, a - b, 1), 3))
+    part = jnp.minimum(jnp.minimum(parts[0], parts[1]), parts[2])
+    corner = jnp.where(parts[0] == part, 0, jnp.where(parts[1] == part, 1, 2))
+    return stored((part, corner, volume))
+
+
+def _follow(
+    face: Int[Array, " n"],
+    neighbors: Int[Array, "F 3"],
+    corners_of: Callable[[Array], Array],
+    ends: list[Columns],
+) -> Int[Array, " n"]:
+    """The edge at which the surface ends, or turns away, on the way from a face."""
+
+    def step(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        face, edge, turn, found, done = state
+        part, corner, volume = _leaves(corners_of(face), ends)
+        turned = (edge >= 0) & (volume * turn <= 0)
+        found = found | (~done & ((face < 0) | turned) & (edge >= 0))
+        done = done | found | (face < 0) | (part > 1)
+        following = neighbors[jnp.maximum(face, 0), corner]
+        next_edge = jnp.where(done, edge, 3 * face + corner)
+        turn = jnp.where(done, turn, jnp.sign(volume))
+        return stored((jnp.where(done, face, following), next_edge, turn, found, done))
+
+    nothing = jnp.zeros_like(face)
+    start = face, nothing - 1, nothing.astype(jnp.float32), face < -1, face < 0
+    _, edge, _, found, _ = lax.fori_loop(0, _STEPS, step, start)
+    return stored(jnp.where(found, _named_once(edge, neighbors), -1))
+
+
+def _named_once(edge: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, " n"]:
+    """Edges by the lower one of their two faces."""
+    face, corner = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    other = neighbors[face, corner]
+    back = neighbors[jnp.maximum(other, 0)] == face[:, None]
+    corner = jnp.where(back[:, 0], 0, jnp.where(back[:, 1], 1, 2))
+    return jnp.where((other >= 0) & (other < face), 3 * other + corner, edge)
