@@ -11,53 +11,44 @@ import pytest
 import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.blend import Method, View, apply_linear, collect
-from diffrast.raster.coverage import visible_faces
 
 SETTINGS = dr.RenderSettings(height=20, width=24, antialias=True)
 LIGHTS = [dr.DirectionalLight(direction=(-0.4, -0.5, -1.0))]
 MESH = dr.shapes.torus(1.0, 0.4, major_segments=9, minor_segments=6)
 
 
+@pytest.fixture(scope="module")
+def seen():
+    """Clip positions of the mesh, and the faces that pixels and border see."""
+    clip = dr.world_to_clip(camera(), MESH.vertices)
+    draw = functools.partial(dr.rasterize, height=20, width=24, border=1)
+    return clip, jax.jit(draw)(clip, MESH.faces).face
+
+
 def camera(eye=(0.3, 2.0, 3.0)):
     return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.9, near=0.1, far=30.0)
 
 
-@jax.jit
-def image(vertices, camera):
+def picture(vertices, camera):
     mesh = dataclasses.replace(MESH, vertices=vertices)
     return dr.render(dr.Scene(objects=[dr.Object(mesh)], lights=LIGHTS), camera, SETTINGS)
 
 
 @jax.jit
-def pulled(vertices, camera, cotangent):
-    return jax.vjp(image, vertices, camera)[1](cotangent)
-
-
-@jax.jit
-def pushed(vertices, camera, change):
-    return jax.jvp(lambda v: image(v, camera), (vertices,), (change,))
-
-
-def test_both_directions_of_the_derivative_agree():
-    random = np.random.default_rng(1)
-    change = jnp.asarray(random.normal(size=MESH.vertices.shape), jnp.float32)
-    cotangent = jnp.asarray(random.normal(size=(20, 24, 3)), jnp.float32)
-    value, moved = pushed(MESH.vertices, camera(), change)
-    np.testing.assert_allclose(value, image(MESH.vertices, camera()), atol=1e-6)
-    forward = np.vdot(moved, cotangent)
-    reverse = np.vdot(pulled(MESH.vertices, camera(), cotangent)[0], change)
-    assert abs(forward - reverse) < 1e-4 * np.linalg.norm(moved) * np.linalg.norm(cotangent)
-    for _ in range(2):
-        again = np.vdot(pulled(MESH.vertices, camera(), cotangent)[0], change)
-        assert again == reverse
+def picture_and_gradient(vertices, camera):
+    """The picture, and the derivatives of its sum."""
+    image, pull = jax.vjp(picture, vertices, camera)
+    return image, pull(jnp.ones_like(image))
 
 
 def test_views_may_be_mapped():
+    """The picture alone, too, equals that of which the derivative is asked."""
     eyes = [(0.3, 2.0, 3.0), (1.5, 1.0, -2.0)]
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(camera(eye) for eye in eyes))
-    together = jax.jit(jax.vmap(image, in_axes=(None, 0)))(MESH.vertices, cameras)
+    together = jax.jit(jax.vmap(picture, in_axes=(None, 0)))(MESH.vertices, cameras)
     for one, eye in zip(together, eyes, strict=True):
-        np.testing.assert_allclose(one, image(MESH.vertices, camera(eye)), atol=1e-6)
+        image, _ = picture_and_gradient(MESH.vertices, camera(eye))
+        np.testing.assert_allclose(one, image, atol=1e-6)
 
 
 @pytest.mark.parametrize("case", ["flat", "point", "edge-on", "behind", "inside", "huge", "tiny"])
@@ -77,39 +68,38 @@ def test_values_and_derivatives_are_finite(case):
         vertices = vertices * 1e6
     elif case == "tiny":
         vertices = vertices * 1e-6
-    cotangent = jnp.ones((20, 24, 3))
-    assert np.all(np.isfinite(image(vertices, camera(eye))))
-    for leaf in jax.tree.leaves(pulled(vertices, camera(eye), cotangent)):
+    for leaf in jax.tree.leaves(picture_and_gradient(vertices, camera(eye))):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.all(np.isfinite(leaf))
 
 
 def test_bodies_that_lie_in_one_another_have_no_line_in_common():
-    """A cube twice, in two colours: nothing changes where nothing does with one."""
+    """A cube twice, in two colours: nothing changes where nothing does with one in view."""
     cube = dr.shapes.cube()
     twice = [dr.Object(cube, dr.Material(diffuse=c)) for c in ((1, 0, 0), (0, 0, 1))]
     settings = dataclasses.replace(SETTINGS, shading="unlit")
     shift = jnp.array([0.3, 0.2, 0.1])
 
-    @functools.partial(jax.jit, static_argnums=0)
-    def moved(number):
+    @jax.jit
+    def moved(second):
         def image(s):
-            matrix = jnp.eye(4).at[:3, 3].set(s * shift)
-            objects = [dataclasses.replace(o, transform=matrix) for o in twice[:number]]
+            places = (s * shift, second + s * shift)
+            objects = [
+                dataclasses.replace(item, transform=dr.linalg.translation(place))
+                for item, place in zip(twice, places, strict=True)
+            ]
             return dr.render(dr.Scene(objects=objects), camera(), settings)
 
         return jax.jvp(image, (0.0,), (1.0,))[1].sum(axis=-1)
 
-    one, two = moved(1), moved(2)
+    behind_the_camera = 2 * jnp.array([0.3, 2.0, 3.0])
+    one, two = moved(behind_the_camera), moved(jnp.zeros(3))
     np.testing.assert_allclose(two[one == 0], 0, atol=1e-4)
     assert np.sum(one == 0) > 200
 
 
-def test_no_piece_is_lost_however_few_records_there_are():
-    size = 24
-    clip = dr.world_to_clip(camera(), MESH.vertices)
-    bordered = clip * jnp.array([size / (size + 2), size / (size + 2), 1, 1])
-    ids = visible_faces(bordered, MESH.faces, height=size + 2, width=size + 2, cull_backfaces=False)
+def test_no_piece_is_lost_however_few_records_there_are(seen):
+    clip, face = seen
     color = jnp.asarray(np.random.default_rng(3).uniform(size=(len(MESH.faces) + 1, 3)))
     view = View(
         positions_clip=clip,
@@ -117,8 +107,8 @@ def test_no_piece_is_lost_however_few_records_there_are():
         turned=None,
         topology=MESH.topology,
         apart=jnp.ones_like(MESH.topology.edges.seam),
-        face_image=ids,
-        image=color[ids].astype(jnp.float32),
+        face_image=face,
+        image=color[face].astype(jnp.float32),
         background=color[-1].astype(jnp.float32),
         scene=None,
     )
@@ -132,7 +122,7 @@ def test_no_piece_is_lost_however_few_records_there_are():
             return apply_linear(view, method, found, points, colors)
 
         points = jnp.ones((len(clip), 3)) * 0.1
-        colors = jnp.ones(((size + 2) ** 2, 3)) * jnp.arange(3.0)
+        colors = jnp.ones((face.size, 3)) * jnp.arange(3.0)
         pushed, pull = jax.vjp(change, points, colors)
         return (
             found.records.total,
@@ -184,6 +174,38 @@ def test_edges_cost_nothing_where_they_are_off():
 COLORS = 0.5 + 0.5 * jnp.sin(2 * MESH.vertices)  # of the vertices; the background is white
 
 
+def test_both_directions_of_the_derivative_agree(seen):
+    clip, face = seen
+    random = np.random.default_rng(1)
+
+    def noise(*shape):
+        return jnp.asarray(random.normal(size=shape), jnp.float32)
+
+    def stage(image, clip):
+        return dr.antialias(image, clip, MESH.faces, face, topology=MESH.topology, creases="all")
+
+    @jax.jit
+    def pushed(at, change):
+        return jax.jvp(stage, at, change)[1]
+
+    @jax.jit
+    def pulled(at, cotangent):
+        return jax.vjp(stage, *at)[1](cotangent)
+
+    at, change = ((noise(*face.shape, 3), x) for x in (clip, noise(*clip.shape)))
+    cotangent = noise(20, 24, 3)
+    moved = pushed(at, change)
+
+    def reverse():
+        return sum(map(np.vdot, pulled(at, cotangent), change))
+
+    first = reverse()
+    assert abs(np.vdot(moved, cotangent) - first) < 1e-4 * (
+        np.linalg.norm(moved) * np.linalg.norm(cotangent)
+    )
+    assert first == reverse() == reverse()
+
+
 def own_picture(vertices, height, width, **options):
     clip = dr.world_to_clip(camera(), vertices)
     size = {"height": height, "width": width}
@@ -199,6 +221,16 @@ def colors_at(colors, face, barycentrics):
     return jnp.einsum("njc,nj->nc", colors[MESH.faces[face]], barycentrics)
 
 
+SHIFT = jnp.array([1.0, 0.3, 0.0])
+FINE = 16
+
+
+@jax.jit
+def sampled(s):
+    fine = own_picture(MESH.vertices + s * SHIFT, 40 * FINE, 48 * FINE)
+    return fine.reshape(40, FINE, 48, FINE, 3).mean(axis=(1, 3))
+
+
 @pytest.mark.parametrize(
     ("options", "image_error", "derivative_error"),
     [
@@ -208,18 +240,13 @@ def colors_at(colors, face, barycentrics):
 )
 def test_a_picture_of_ones_own_gets_its_edges(options, image_error, derivative_error):
     """Against many samples a pixel, and the derivative against differences of these."""
-    side, step, shift = 16, 0.02, jnp.array([1.0, 0.3, 0.0])
+    step = 0.02
     weights = jnp.sin(jnp.arange(40.0)[:, None, None] / 10 + jnp.arange(48.0)[:, None] / 14)
-
-    @jax.jit
-    def sampled(s):
-        fine = own_picture(MESH.vertices + s * shift, 40 * side, 48 * side)
-        return fine.reshape(40, side, 48, side, 3).mean(axis=(1, 3))
 
     @jax.jit
     def with_edges(s):
         return jax.jvp(
-            lambda s: own_picture(MESH.vertices + s * shift, 40, 48, **options), (s,), (1.0,)
+            lambda s: own_picture(MESH.vertices + s * SHIFT, 40, 48, **options), (s,), (1.0,)
         )
 
     image, change = with_edges(0.0)

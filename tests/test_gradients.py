@@ -46,7 +46,10 @@ def moved_light(light, params):
 
 
 def scene_of(problem):
-    """The scene and the camera of a problem as functions of its parameters."""
+    """The scene and the camera of a problem as functions of its parameters.
+
+    A tree of arrays: problems of equal shapes have one compiled program in common.
+    """
     objects = [
         dr.Object(
             dr.Mesh(vertices=o.vertices, faces=o.faces, normals=o.normals),
@@ -55,41 +58,52 @@ def scene_of(problem):
         for o in problem.objects
     ]
     lights = [light_of(light) for light in problem.lights]
-    caster = reference.caster(problem)
+    scene = dr.Scene(objects=objects, lights=lights, background=problem.background)
+    place = {"eye": problem.eye, "target": problem.target, "up": problem.up}
+    place |= {"near": problem.near, "far": problem.far}
+    if problem.window is None:
+        camera = dr.Camera.perspective(fov_y=problem.fov_y, **place)
+    else:
+        camera = dr.Camera.orthographic(height=problem.window, **place)
     pivot = jnp.asarray(problem.objects[0].pivot)
-    camera = dr.Camera.perspective(
-        eye=problem.eye, target=problem.target, up=problem.up, fov_y=problem.fov_y,
-        near=problem.near, far=problem.far,
-    )  # fmt: skip
-
-    def at(params):
-        turn = dr.linalg.so3_exp(params[:3])
-        motion = jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(params[3:6])
-        zoom = jnp.array([jnp.exp(-params[6]), jnp.exp(-params[6]), 1, 1])
-        moved = dr.Camera(view=motion @ camera.view, projection=zoom[:, None] * camera.projection)
-        turn = dr.linalg.so3_exp(params[7:10])
-        shift = pivot - turn @ pivot + params[10:13]
-        placed = jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(shift)
-        first = dr.Object(objects[0].mesh, objects[0].material, placed)
-        shining = [
-            moved_light(light, params) if number == caster else light
-            for number, light in enumerate(lights)
-        ]
-        scene = dr.Scene(
-            objects=[first, *objects[1:]], lights=shining, background=problem.background
-        )
-        return scene, moved
-
-    return at
+    return jax.tree_util.Partial(moved_scene, scene, camera, pivot)
 
 
-def renderer(problem, **options):
-    at = scene_of(problem)
-    settings = dr.RenderSettings(
+def moved_scene(scene, camera, pivot, params):
+    turn = dr.linalg.so3_exp(params[:3])
+    motion = jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(params[3:6])
+    zoom = jnp.array([jnp.exp(-params[6]), jnp.exp(-params[6]), 1, 1])
+    moved = dr.Camera(view=motion @ camera.view, projection=zoom[:, None] * camera.projection)
+    turn = dr.linalg.so3_exp(params[7:10])
+    shift = pivot - turn @ pivot + params[10:13]
+    placed = jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(shift)
+    objects = [replace(scene.objects[0], transform=placed), *scene.objects[1:]]
+    lights = list(scene.lights)
+    casters = [k for k, light in enumerate(lights) if getattr(light, "shadow", None)]
+    for caster in casters[:1]:
+        lights[caster] = moved_light(lights[caster], params)
+    return replace(scene, objects=objects, lights=lights), moved
+
+
+def settings_of(problem, **options):
+    return dr.RenderSettings(
         height=problem.size, width=problem.size, shading=problem.shading,
-        cull_backfaces=problem.cull_backfaces, **({"antialias": True} | options),
+        cull_backfaces=problem.cull_backfaces, **options,
     )  # fmt: skip
-    return lambda params: dr.render(*at(params), settings)
+
+
+@jax.jit
+def rendered(at, params, settings):
+    return dr.render(*at(params), settings)
+
+
+@jax.jit
+def derivatives(at, params, settings, fields, target):
+    """The image, its derivatives projected on fields, and that of the L2 loss to the target."""
+    image, pull = jax.vjp(lambda params: rendered(at, params, settings), params)
+    every = jnp.concatenate([fields, (image - target)[None]])
+    pulled = jax.lax.map(lambda field: pull(field)[0], every)
+    return image, pulled[:-1], pulled[-1]
 
 
 # Largest relative errors of projections on random fields, and of the gradient of an L2 loss. The
@@ -116,7 +130,8 @@ def test_derivatives_are_those_of_the_box_filtered_image(name):
     if name in BETTER:
         times, samples = BETTER[name]
         problem = reference.SCENES[name]()
-        plain = renderer(problem, antialias=False, samples=samples)(jnp.zeros(13))
+        settings = settings_of(problem, antialias=False, samples=samples)
+        plain = rendered(scene_of(problem), jnp.zeros(13), settings)
         assert times * image_error < np.abs(plain - reference.reference_image(problem)).mean()
 
 
@@ -159,27 +174,20 @@ def test_derivatives_by_vertices():
 
 
 def test_parallel_projection_has_the_same_edges():
-    problem = replace(reference.piercing(), size=48, window=3.0)
-    frame = {"eye": problem.eye, "target": problem.target, "up": problem.up}
-    camera = dr.Camera.orthographic(height=3.0, near=problem.near, far=problem.far, **frame)
-    settings = dr.RenderSettings(height=48, width=48, antialias=True)
+    problem = replace(reference.piercing(), window=3.0)
     shift, step = np.array([0.3, -0.2, 0.5]), 1e-2
 
     def truth(steps):
         params = np.append(np.zeros(10), steps * step * shift)
         return reference.reference_image(problem, params)
 
-    @jax.jit
-    def image(shift):
-        scene, _ = scene_of(problem)(jnp.zeros(13).at[10:].set(shift))
-        return dr.render(scene, camera, settings)
-
-    ours, moved = jax.jvp(image, (jnp.zeros(3),), (jnp.asarray(shift, jnp.float32),))
+    fields = reference.adjoint_fields(problem.size)
+    ours, got, _ = derivatives(
+        scene_of(problem), jnp.zeros(13), settings_of(problem), np.float32(fields), truth(0)
+    )
     assert np.abs(ours - truth(0)).mean() < 1e-4
-    change = (truth(1) - truth(-1)) / (2 * step)
-    fields = reference.adjoint_fields(48)
-    got, want = (np.einsum("fhwc,hwc->f", fields, x) for x in (moved, change))
-
+    got = got[:, 10:] @ shift
+    want = np.einsum("fhwc,hwc->f", fields, (truth(1) - truth(-1)) / (2 * step))
     assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
 
 
@@ -187,12 +195,11 @@ def errors(name, **options):
     """Relative errors of the projected derivatives and of the L2 gradient, by parameter group."""
     problem = reference.SCENES[name]()
     stored = reference.load(name)
-    render = renderer(problem, **options)
-    fields = jnp.asarray(reference.adjoint_fields(problem.size), jnp.float32)
-    image, pull = jax.vjp(jax.jit(render), jnp.zeros(reference.parameters(problem)))
-    projections = np.stack([np.asarray(pull(field.reshape(image.shape))[0]) for field in fields])
-    target = reference.reference_image(problem, stored["target_image_params"])
-    gradient = np.asarray(pull(image - jnp.asarray(target, jnp.float32))[0])
+    fields = np.float32(reference.adjoint_fields(problem.size))
+    target = np.float32(reference.reference_image(problem, stored["target_image_params"]))
+    start, settings = jnp.zeros(reference.parameters(problem)), settings_of(problem, **options)
+    results = derivatives(scene_of(problem), start, settings, fields, target)
+    image, projections, gradient = map(np.asarray, results)
     units = reference.step_sizes(problem)
     result = {}
     for group, part in reference.groups(problem).items():

@@ -1,4 +1,4 @@
-"""Every transformation of JAX on the whole renderer: the same numbers, whichever way."""
+"""Every transformation of JAX on the renderer and on its edges: the same numbers, whichever way."""
 
 import jax
 import jax.numpy as jnp
@@ -9,110 +9,105 @@ import diffrast as dr
 
 EYES = jnp.array([[0.0, 0.0, 3.0], [0.0, 1.0, 3.0], [1.0, 1.0, 3.0], [2.0, 0.0, 3.0]])
 TANGENT = jnp.array([1.0, 2.0, 3.0])
+MESH = dr.shapes.icosphere(1)
+SCENE = dr.Scene(objects=[dr.Object(MESH)], lights=[dr.PointLight(position=(2, 2, 3))])
+SIZE = {"height": 24, "width": 32}
+VIEWS = jax.sharding.PartitionSpec("views")
 
 
-@pytest.fixture(scope="module")
-def image():
-    return renderer(antialias=False)
-
-
-def renderer(antialias):
-    mesh = dr.shapes.icosphere(1)
-    settings = dr.RenderSettings(height=24, width=32, antialias=antialias)
-    scene = dr.Scene(
-        objects=[dr.Object(mesh)],
-        lights=[dr.PointLight(position=(2, 2, 3))],
+def camera(eye):
+    return dr.Camera.perspective(
+        eye=eye, target=(0, 0, 0), up=(0, 1, 0), fov_y=0.7, near=0.1, far=10
     )
 
-    def image(eye):
-        camera = dr.Camera.perspective(
-            eye=eye, target=(0, 0, 0), up=(0, 1, 0), fov_y=0.7, near=0.1, far=10
-        )
-        return dr.render(scene, camera, settings)
 
-    return image
+def image(eye):
+    return dr.render(SCENE, camera(eye), dr.RenderSettings(**SIZE, antialias=False))
+
+
+def loss(eye):
+    return jnp.mean(image(eye) ** 2)
+
+
+def in_pairs(function, eyes):
+    """The function under vmap under a loop."""
+    return jax.lax.map(jax.vmap(function), eyes.reshape(2, 2, 3))
+
+
+def sharded(function):
+    devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
+    return jax.jit(jax.shard_map(function, mesh=devices, in_specs=VIEWS, out_specs=VIEWS))
 
 
 @pytest.fixture(scope="module")
-def loss(image):
-    return lambda eye: jnp.mean(image(eye) ** 2)
-
-
-@pytest.fixture(scope="module")
-def gradients(loss):
+def gradients():
     gradient = jax.jit(jax.grad(loss))
     return np.stack([gradient(eye) for eye in EYES])
 
 
-@pytest.fixture(scope="module")
-def images(image):
-    return np.stack([image(eye) for eye in EYES])
+def test_vmap_and_map_give_single_images():
+    images = jax.jit(lambda eyes: in_pairs(image, eyes))(EYES)
+    for eye, got in zip(EYES, images.reshape(4, 24, 32, 3), strict=True):
+        np.testing.assert_array_equal(got, image(eye))
 
 
-def test_vmap_and_map_give_single_images(image, images):
-    np.testing.assert_array_equal(jax.jit(jax.vmap(image))(EYES), images)
-    np.testing.assert_array_equal(jax.lax.map(image, EYES), images)
-
-
-def test_grad_of_vmap(loss, gradients):
-    of_all = jax.jit(jax.grad(lambda eyes: jax.vmap(loss)(eyes).sum()))(EYES)
-    np.testing.assert_allclose(of_all, gradients, rtol=1e-5, atol=1e-7)
-
-
-def test_forward_mode_equals_reverse_mode(loss, gradients):
-    @jax.jit
-    def forward(eye):
-        return jax.linearize(loss, eye)[1](TANGENT)
-
-    np.testing.assert_allclose(forward(EYES[0]), gradients[0] @ TANGENT, rtol=1e-4)
-
-
-def test_grad_of_scan_with_checkpoints(loss, gradients):
+def test_grad_of_scan_of_vmap_with_checkpoints(gradients):
     def total(eyes):
-        step = jax.checkpoint(lambda sum_, eye: (sum_ + loss(eye), None))
-        return jax.lax.scan(step, 0.0, eyes)[0]
+        return in_pairs(jax.checkpoint(loss), eyes).sum()
 
     np.testing.assert_allclose(jax.jit(jax.grad(total))(EYES), gradients, rtol=1e-5, atol=1e-7)
 
 
-def test_hessian_vector_product(loss):
+def test_shard_map_of_vmap_of_grad(gradients):
+    of_all = sharded(jax.vmap(jax.grad(loss)))
+    np.testing.assert_allclose(of_all(EYES), gradients, rtol=1e-5, atol=1e-7)
+
+
+def test_forward_mode_equals_reverse_mode_to_second_order(gradients):
     with jax.enable_x64(True):
         eye, tangent = jnp.asarray(EYES[1], jnp.float64), jnp.asarray(TANGENT, jnp.float64)
-        gradient = jax.jit(jax.grad(loss))
-        product = jax.jit(lambda e, t: jax.jvp(gradient, (e,), (t,))[1])(eye, tangent)
+
+        @jax.jit
+        def derivatives(eye):
+            return jax.jvp(jax.value_and_grad(loss), (eye,), (tangent,))
+
+        (_, gradient), (slope, product) = derivatives(eye)
         step = 1e-5 * tangent
-        difference = (gradient(eye + step) - gradient(eye - step)) / 2e-5
+        ahead, behind = (derivatives(eye + s * step)[0][1] for s in (1, -1))
+        difference = (ahead - behind) / 2e-5
         assert product.dtype == jnp.float64
+        np.testing.assert_allclose(slope, gradient @ tangent, rtol=1e-10)
+    np.testing.assert_allclose(slope, gradients[1] @ TANGENT, rtol=1e-4)
     # Pixels whose face changes within the step are the difference's, not the derivative's.
     np.testing.assert_allclose(product, difference, rtol=2e-2, atol=1e-4)
 
 
-def test_shard_map(loss, gradients):
-    devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
-    views = jax.sharding.PartitionSpec("views")
-    gradient = jax.vmap(jax.grad(loss))
-    sharded = jax.jit(jax.shard_map(gradient, mesh=devices, in_specs=views, out_specs=views))
-    np.testing.assert_allclose(sharded(EYES), gradients, rtol=1e-5, atol=1e-7)
-
-
 def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
-    image = renderer(antialias=True)
+    """On the stage alone: faces of one colour each, which changes with the eye."""
 
-    def loss(eye):
-        return jnp.mean(image(eye) ** 2)
+    def seen(eye):
+        clip = dr.world_to_clip(camera(eye), MESH.vertices)
+        return dr.rasterize(clip, MESH.faces, border=1, **SIZE).face
 
-    def derivatives(eye):  # the second one without that of what is visible
-        return jax.jvp(jax.grad(loss), (eye,), (TANGENT,))
+    def loss(eye, face):
+        clip = dr.world_to_clip(camera(eye), MESH.vertices)
+        colors = 0.1 * eye + jnp.sin(jnp.arange(3.0 * len(MESH.faces))).reshape(-1, 3)
+        picture = jnp.where(face[..., None] >= 0, colors[face], 0.0)
+        with_edges = dr.antialias(
+            picture, clip, MESH.faces, face, topology=MESH.topology, creases="all",
+            shader=lambda colors, face, at: colors[face], data=colors,
+        )  # fmt: skip
+        return jnp.mean(with_edges**2)
 
-    devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
-    views = jax.sharding.PartitionSpec("views")
+    def derivatives(none, view):  # the second one without that of what is visible
+        eye, face = view
+        gradient = jax.grad(loss)
+        return none, jax.jvp(lambda eye: gradient(eye, face), (eye,), (TANGENT,))
 
-    def of_all(eyes):
-        return jax.lax.scan(lambda none, eye: (none, derivatives(eye)), None, eyes)[1]
-
-    sharded = jax.shard_map(of_all, mesh=devices, in_specs=views, out_specs=views)
-    gradients, products = jax.jit(sharded)(EYES[:2])
-    mapped = jax.jit(jax.vmap(jax.grad(loss)))(EYES[:2])
+    views = EYES[:2], jax.jit(lambda eyes: jax.lax.map(seen, eyes))(EYES[:2])
+    of_all = sharded(lambda views: jax.lax.scan(derivatives, None, views)[1])
+    gradients, products = of_all(views)
+    mapped = jax.jit(jax.vmap(jax.grad(loss)))(*views)
     np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
     assert np.all(np.isfinite(products))
     assert np.all(np.any(products != 0, axis=1))
