@@ -387,9 +387,8 @@ def _with_shadow(
     glow = jnp.stack(method.glow(view.scene, light, line.face, line.barycentrics), axis=-1)
     jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
     own = view.image.reshape(-1, view.image.shape[2])[_place(view, pixel, 4)]
-    to_other = jnp.where(line.centre_on_right, -1, 1)[:, None] * jump
-    value = area[:, None] * jump - jnp.where(line.wrong_side[:, None], to_other, 0)
-    to_other = jnp.where(line.wrong_side[:, None], -to_other, to_other)
+    to_other = jnp.where(line.centre_is_lit, -1, 1)[:, None] * glow
+    value = area[:, None] * jump + jnp.where(line.wrong_side[:, None], to_other, 0)
     held = jnp.stack([own, own + to_other])
     total, number = _with_values(total, view, pixel, line.used, value, held)
     places = [_place(view, pixel, look) for look in line.look]

@@ -79,7 +79,7 @@ class Shadow(NamedTuple):
     barycentrics: Columns  # and where its middle does
     look: Int[Array, "2 n"]  # 0 to 8: pixels on the right and on the left
     lit_on_right: Bool[Array, " n"]
-    centre_on_right: Bool[Array, " n"]
+    centre_is_lit: Bool[Array, " n"]  # in the image
     wrong_side: Bool[Array, " n"]  # the image has the centre on the other side of the line
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
@@ -243,7 +243,7 @@ def shadow_of(
         barycentrics=barycentrics(e),
         look=look,
         lit_on_right=lit_on_right,
-        centre_on_right=centre_on_right,
+        centre_is_lit=outlines.centre_is_lit,
         wrong_side=alone & ((lit_on_right == centre_on_right) != outlines.centre_is_lit),
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,

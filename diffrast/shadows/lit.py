@@ -41,6 +41,16 @@ class Rays(NamedTuple):
     asked: Bool[Array, " n"]  # false where the light does not shine
 
 
+class Nearby(NamedTuple):
+    """The faces at the 3×3 texels round rays; corners are x, y and z by rows."""
+
+    face: Int[Array, "9 n"]
+    key: Float[Array, "9 n"]
+    corners: Float[Array, "3 3 9 n"]
+    own: Float[Array, "3 3 n"]  # of the face on which the ray begins
+    stops: Float[Array, "9 n"]  # positive for faces that stop the ray
+
+
 class _Texel(NamedTuple):
     """Texels, and where points lie from their centres."""
 
@@ -99,20 +109,12 @@ def _at_texels(values: Array, picture: Array, texel: _Texel) -> Array:
 
 def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, " n"]:
     """Whether faces near the rays from points to the light stop them."""
-    around, own, others, stops = stopping(pictures, geometry, rays)
-    found = jnp.max(stops, axis=0) > 0
-    nearest = others[:, :, 4]
-    return found | _hidden_by_small(pictures, rays, _texel_of(pictures, rays), around, own, nearest)
+    nearby = faces_near(pictures, geometry, rays)
+    return (jnp.max(nearby.stops, axis=0) > 0) | _hidden_by_small(pictures, rays, nearby)
 
 
-def stopping(
-    pictures: Pictures, geometry: Geometry, rays: Rays
-) -> tuple[Int[Array, "9 n"], Array, Array, Float[Array, "9 n"]]:
-    """Faces at the 3×3 texels round points, and which of them stop the rays to the light.
-
-    The faces; the corners of the points' own faces and of these, x, y and z by rows; and numbers
-    that are positive for faces that stop a ray.
-    """
+def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
+    """The faces at the 3×3 texels round rays, and which of them stop these."""
     texel = _texel_of(pictures, rays)
     last = pictures.face.shape[1] - 1
     nine = jnp.arange(9)[:, None]
@@ -135,27 +137,27 @@ def stopping(
     ray, corners = stored((ray, (others - origin[:, None, None]) - point[:, None, None]))
     stops = _stops(corners, ray[:, None], endless=source[3] == 0)
     foreign = (around >= 0) & (around != rays.face)
-    return around, own, others, jnp.where(foreign, stops, -1)
+    key = pictures.texel[rays.picture, row, column, 0]
+    return Nearby(around, key, others, own, jnp.where(foreign, stops, -1))
 
 
-def _hidden_by_small(
-    pictures: Pictures, rays: Rays, texel: _Texel, around: Array, own: Array, nearest: Array
-) -> Bool[Array, " n"]:
+def _hidden_by_small(pictures: Pictures, rays: Rays, nearby: Nearby) -> Bool[Array, " n"]:
     """Whether points lie behind the nearest texel, of faces too small for a texel each.
 
     What is compared are the planes of the point's own face and of the nearest texel's, with a
     margin for surfaces that curve from one to the other.
     """
-    own_slopes, _ = _slopes(pictures, rays, own)
-    slopes, area = _slopes(pictures, rays, nearest)
+    own_slopes, _ = _slopes(pictures, rays, nearby.own)
+    slopes, area = _slopes(pictures, rays, nearby.corners[:, :, 4])
+    texel = _texel_of(pictures, rays)
     at = texel.x, texel.y
-    behind = _at_texels(pictures.texel, rays.picture, texel)[:, 0] - rays.key
+    behind = nearby.key[4] - rays.key
     behind = behind + own_slopes[0] * at[0] + own_slopes[1] * at[1]
     margin = jnp.abs((slopes[0] - own_slopes[0]) * at[0])
     margin = margin + jnp.abs((slopes[1] - own_slopes[1]) * at[1])
     margin = margin + _ROUNDINGS * jnp.finfo(margin.dtype).eps * rays.unit
-    face = around[4]
-    shown = jnp.any(around == rays.face, axis=0)
+    face = nearby.face[4]
+    shown = jnp.any(nearby.face == rays.face, axis=0)
     hidden = (face >= 0) & (face != rays.face) & (behind > margin)
     return hidden & ((area < _SMALL) | ~shown)
 

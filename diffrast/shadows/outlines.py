@@ -24,7 +24,7 @@ from diffrast.geometry import Geometry, Points
 from diffrast.light import Light, casts_shadow
 from diffrast.raster.fixed_point import CULLED, group_by_class
 from diffrast.shadows.cast import Reached, Shadows, by_resolution
-from diffrast.shadows.lit import Rays, stopping, turned_to
+from diffrast.shadows.lit import Rays, faces_near, turned_to
 from diffrast.shadows.maps import Pictures
 from diffrast.shadows.views import sides
 
@@ -157,12 +157,13 @@ def _edge_between(
         unit=zero,
         asked=zero == 0,
     )
-    around, _, _, stops = stopping(pictures, geometry, rays)
-    part, _, _ = _leaves(stored(seen(corners_of(around))), ends)
-    part = stored(jnp.where((stops > 0) & (part < 2), part, -1))
+    nearby = faces_near(pictures, geometry, rays)
+    part, _, _ = _leaves(stored(seen(corners_of(nearby.face))), ends)
+    part = stored(jnp.where((nearby.stops > 0) & (part < 2), part, -1))
     farthest = jnp.max(part, axis=0)
-    row = jnp.where(farthest >= 0, first_row(part == farthest), 4)
-    face = picked(around, row)
+    nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
+    row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
+    face = picked(nearby.face, row)
     face = jnp.where(turned_to(pictures.plan.source[picture], geometry, dark.face), face, -1)
     return _follow(face, topology.neighbors, lambda face: seen(corners_of(face)), ends)
 
