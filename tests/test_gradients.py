@@ -115,9 +115,17 @@ BOUNDS = {
     "torus2": (0.03, 0.02),
     "lattice": (0.015, 0.015),
     "piercing": (0.003, 0.02),
+    "shadow_sun": (0.01, 0.01),
+    "shadow_hidden": (0.002, 0.015),
 }
 # How many times smaller the error of the image is than that of so many samples.
-BETTER = {"cubes": (100, 1), "sphere": (1, 16), "lattice": (10, 16), "piercing": (100, 1)}
+BETTER = {
+    "cubes": (100, 1),
+    "sphere": (1, 16),
+    "lattice": (10, 16),
+    "piercing": (100, 1),
+    "shadow_sun": (20, 1),
+}
 
 
 @pytest.mark.parametrize("name", BOUNDS)
@@ -131,7 +139,7 @@ def test_derivatives_are_those_of_the_box_filtered_image(name):
         times, samples = BETTER[name]
         problem = reference.SCENES[name]()
         settings = settings_of(problem, antialias=False, samples=samples)
-        plain = rendered(scene_of(problem), jnp.zeros(13), settings)
+        plain = rendered(scene_of(problem), jnp.zeros(reference.parameters(problem)), settings)
         assert times * image_error < np.abs(plain - reference.reference_image(problem)).mean()
 
 

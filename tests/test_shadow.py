@@ -252,7 +252,7 @@ def pictures():
             transform = parameters["transform"]
             objects = (replace(scene.objects[0], transform=transform), scene.objects[1])
             moved = replace(scene, lights=lights, objects=objects)
-            image = dr.render(moved, camera, settings())
+            image = dr.render(moved, camera, settings(antialias=True))
             return jnp.mean(image**2), image
 
         return jax.grad(loss, has_aux=True)(parameters)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
-from diffrast.edges.planes import Columns, edge_functions
+from diffrast.edges.planes import edge_functions
 from diffrast.geometry import Geometry, Points
 from diffrast.light import Light, casts_shadow
 from diffrast.raster.fixed_point import CULLED, group_by_class
@@ -178,7 +178,7 @@ def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"])
 
 
 def _leaves(
-    corners: Float[Array, "3 3 *n"], ends: list[Columns]
+    corners: Float[Array, "3 3 *n"], ends: list[list[Array]]
 ) -> tuple[Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
     """Where on the way between two points, 0 to 1, a face ends; 3 if it does not.
 
@@ -200,7 +200,7 @@ def _follow(
     face: Int[Array, " n"],
     neighbors: Int[Array, "F 3"],
     corners_of: Callable[[Array], Array],
-    ends: list[Columns],
+    ends: list[list[Array]],
 ) -> Int[Array, " n"]:
     """The edge at which the surface ends, or turns away, on the way from a face."""
 
