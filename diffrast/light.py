@@ -36,8 +36,9 @@ class Shadow:
 
     Attributes:
         resolution: rows and columns of the picture that the light takes of the scene, static. It is
-            fitted to what the camera sees. Outlines of faces that several of its pixels show are
-            exact whatever the resolution; what falls between its pixels casts no shadow.
+            fitted to what the camera sees. Outlines of shadows are exact whatever the resolution,
+            with `RenderSettings(antialias=True)` within pixels too and with their derivative; what
+            falls between two pixels of the picture casts no shadow.
 
     Raises:
         ValueError: for anything but an integer from 8 to 8192.

@@ -2,6 +2,7 @@
 
 import json
 
+import fit_light_from_shadow
 import fit_pose
 import fit_shape
 import jax.numpy as jnp
@@ -27,6 +28,15 @@ def test_the_pose_of_a_lattice_is_found(tmp_path):
         assert row["visibility"][name] < 0.2 * row["at_start"][name]
     assert json.loads((tmp_path / "fit_pose.json").read_text())["seed"] == 0
     assert (tmp_path / "fit_pose.png").is_file()
+
+
+def test_a_light_is_found_from_its_shadow(tmp_path):
+    report = fit_light_from_shadow.run(tmp_path, kinds=("direction",), starts=1, size=48)
+    (row,) = report["lights"]["direction"]["starts"]
+    assert row["at_start"]["degrees"] > 1
+    assert row["found"]["degrees"] < 0.5
+    assert json.loads((tmp_path / "fit_light_from_shadow.json").read_text())["seed"] == 0
+    assert (tmp_path / "fit_direction_from_shadow.png").is_file()
 
 
 def test_distances_are_those_along_the_normal():
