@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -222,6 +223,32 @@ def save_comparison(
     encoded = [np.asarray(dr.color.linear_to_srgb(image)) for image in (target, start, result)]
     difference = np.clip(0.5 + gain * (encoded[2] - encoded[0]), 0, 1)
     dr.save_image(path, np.concatenate([*encoded, difference], axis=1), srgb=False)
+
+
+def random_start_options(
+    description: str | None, out: str, *, starts: int, size: int
+) -> argparse.ArgumentParser:
+    """Options of fits from random starts."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=Path("results") / out)
+    parser.add_argument("--starts", type=int, default=starts)
+    parser.add_argument("--size", type=int, default=size, help="rows and columns of the pictures")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    return parser
+
+
+def show_fit(axes: Sequence[Any], target: Array, start: Array, result: Array) -> None:
+    """Draw the pictures of a fit side by side, with 16 times their difference round grey."""
+    encoded = [np.clip(dr.color.linear_to_srgb(image), 0, 1) for image in (target, start, result)]
+    difference = np.clip(0.5 + 16 * (encoded[2] - encoded[0]), 0, 1)
+    titles = ("target", "start", "result", "16 times the difference")
+    for axis, image, title in zip(axes, (*encoded, difference), titles, strict=True):
+        axis.imshow(image)
+        axis.set_title(title)
+        axis.axis("off")
 
 
 def statistics(outcomes: list[dict[str, Any]], criterion: dict[str, float]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ Written to `--out`: `fit_light_from_shadow.json` with every start, and a picture
 one fit (target, start, result, 16 times their difference round grey) and the errors of all starts.
 """
 
-import argparse
+import functools
 import time
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, save_json, statistics
+from common import pyplot, random_start_options, save_json, show_fit, statistics
 from fitting import Patience
 from jax import Array
 
@@ -83,23 +83,15 @@ def picture(light: dr.DirectionalLight | dr.PointLight, settings: dr.RenderSetti
     return dr.render(scene, CAMERA, settings)
 
 
-def direction_residuals(
-    params: Array, start: Array, target: Array, blur: Array, settings: dr.RenderSettings
+def residuals(
+    kind: str, params: Array, start: Array, target: Array, blur: Array, settings: dr.RenderSettings
 ) -> Array:
-    """Blurred difference of the pictures, for a directional light."""
-    difference = picture(light_at("direction", start, params), settings) - target
+    """Blurred difference of the pictures."""
+    difference = picture(light_at(kind, start, params), settings) - target
     return dr.fit.gaussian_blur(difference, blur, radius=settings.height // 5)
 
 
-def position_residuals(
-    params: Array, start: Array, target: Array, blur: Array, settings: dr.RenderSettings
-) -> Array:
-    """Blurred difference of the pictures, for a point light."""
-    difference = picture(light_at("position", start, params), settings) - target
-    return dr.fit.gaussian_blur(difference, blur, radius=settings.height // 5)
-
-
-RESIDUALS = {"direction": direction_residuals, "position": position_residuals}
+RESIDUALS = {kind: functools.partial(residuals, kind) for kind in TRUTH}  # each compiles once
 
 
 def random_start(kind: str, generator: np.random.Generator) -> tuple[Array, Array]:
@@ -180,15 +172,9 @@ def plot(path: Path, images: list[Array], rows: list[dict[str, Any]], kind: str)
     """Draw target, start, result and difference of one fit, and the errors of all starts."""
     path.parent.mkdir(parents=True, exist_ok=True)
     plt = pyplot()
-    encoded = [np.clip(dr.color.linear_to_srgb(image), 0, 1) for image in images]
-    difference = np.clip(0.5 + 16 * (encoded[2] - encoded[0]), 0, 1)
     figure = plt.figure(figsize=(12, 7), layout="constrained")
     axes = figure.subplot_mosaic("abcd;eeee")
-    titles = ("target", "start", "result", "16 times the difference")
-    for place, image, title in zip("abcd", (*encoded, difference), titles, strict=True):
-        axes[place].imshow(image)
-        axes[place].set_title(title)
-        axes[place].axis("off")
+    show_fit([axes[place] for place in "abcd"], *images)
     ((name, limit),) = CRITERION[kind].items()
     axes["e"].semilogy([row["at_start"][name] for row in rows], "kx", label="start")
     axes["e"].semilogy([row["found"][name] for row in rows], "o", label="result")
@@ -201,15 +187,8 @@ def plot(path: Path, images: list[Array], rows: list[dict[str, Any]], kind: str)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/fit_light_from_shadow"))
-    parser.add_argument("--starts", type=int, default=20)
-    parser.add_argument("--size", type=int, default=128, help="rows and columns of the picture")
+    parser = random_start_options(__doc__, "fit_light_from_shadow", starts=20, size=128)
     parser.add_argument("--steps", type=int, default=12, help="at most, of each level of blur")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     report = run(options.pop("out"), progress=not options.pop("quiet"), **options)
     for kind, figures in report["lights"].items():

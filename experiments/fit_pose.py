@@ -20,7 +20,6 @@ Written to `--out`: `fit_pose.json` with every start, and `fit_pose.png` with on
 start, result, 16 times their difference round grey) and the errors of all starts.
 """
 
-import argparse
 import time
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, save_json, statistics
+from common import pyplot, random_start_options, save_json, show_fit, statistics
 from fitting import Patience
 from jax import Array
 
@@ -190,15 +189,9 @@ def run(
 def plot(path: Path, images: tuple[Array, Array, Array], rows: list[dict[str, Any]]) -> None:
     """Draw target, start, result and difference of one fit, and the errors of all starts."""
     plt = pyplot()
-    encoded = [np.clip(dr.color.linear_to_srgb(image), 0, 1) for image in images]
-    difference = np.clip(0.5 + 16 * (encoded[2] - encoded[0]), 0, 1)
     figure = plt.figure(figsize=(12, 7), layout="constrained")
     axes = figure.subplot_mosaic("abcd;eeff")
-    titles = ("target", "start", "result", "16 times the difference")
-    for place, image, title in zip("abcd", (*encoded, difference), titles, strict=True):
-        axes[place].imshow(image)
-        axes[place].set_title(title)
-        axes[place].axis("off")
+    show_fit([axes[place] for place in "abcd"], *images)
     labels = ("rotation error (degrees)", "translation error (% of size)")
     for place, name, label in zip("ef", CRITERION, labels, strict=True):
         axes[place].semilogy([row["at_start"][name] for row in rows], "kx", label="start")
@@ -213,21 +206,14 @@ def plot(path: Path, images: tuple[Array, Array, Array], rows: list[dict[str, An
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/fit_pose"))
-    parser.add_argument("--starts", type=int, default=20)
-    parser.add_argument("--size", type=int, default=128, help="rows and columns of the picture")
+    parser = random_start_options(__doc__, "fit_pose", starts=20, size=128)
     parser.add_argument("--cells", type=int, default=4, help="of the lattice, along each edge")
     parser.add_argument("--degrees", type=float, default=8.0, help="turn the starts by up to")
     parser.add_argument("--percent", type=float, default=5.0, help="move the starts by up to")
     parser.add_argument("--steps", type=int, default=12, help="at most, of each level of blur")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--compare", action="store_true", help="fit without the derivative of visibility too"
     )
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     report = run(options.pop("out"), progress=not options.pop("quiet"), **options)
     for name, figures in report["methods"].items():

@@ -17,7 +17,6 @@ Written to `--out`: `fit_robustness.json` with every start, and `fit_robustness.
 errors by the angle of the start and by the renders used.
 """
 
-import argparse
 import dataclasses
 import functools
 import time
@@ -33,6 +32,7 @@ from common import (
     View,
     load_problem,
     pyplot,
+    random_start_options,
     render_view,
     save_json,
     statistics,
@@ -202,15 +202,8 @@ def plot_outcomes(path: Path, rows: list[dict[str, Any]], methods: list[str]) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/fit_robustness"))
-    parser.add_argument("--starts", type=int, default=50)
-    parser.add_argument("--size", type=int, default=64, help="rows and columns of the pictures")
+    parser = random_start_options(__doc__, "fit_robustness", starts=50, size=64)
     parser.add_argument("--degrees", type=float, default=25.0, help="turn the starts by up to")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     report = run(options.pop("out"), progress=not options.pop("quiet"), **options)
     for name, found in report["methods"].items():

@@ -63,6 +63,11 @@ def test_shard_map_of_vmap_of_grad(gradients):
     np.testing.assert_allclose(of_all(EYES), gradients, rtol=1e-5, atol=1e-7)
 
 
+def test_linearized_it_equals_the_gradient(gradients):
+    slope = jax.jit(lambda eye: jax.linearize(loss, eye)[1](TANGENT))(EYES[0])
+    np.testing.assert_allclose(slope, gradients[0] @ TANGENT, rtol=1e-4)
+
+
 def test_forward_mode_equals_reverse_mode_to_second_order(gradients):
     with jax.enable_x64(True):
         eye, tangent = jnp.asarray(EYES[1], jnp.float64), jnp.asarray(TANGENT, jnp.float64)
