@@ -173,7 +173,7 @@ def _with_edges(
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
     apart = apart_edges(geometry, topology.edges, settings.shading)
     if world.shadows is not None:
-        apart = apart | terminators(world.scene.lights, world.shadows, geometry, topology.edges)
+        apart = apart | terminators(world.shadows, topology.edges)
     view = View(
         positions_clip=positions_clip,
         faces=geometry.faces,

@@ -53,17 +53,23 @@ def cast_outlines(
     scene, camera, geometry, shadows = world
     if shadows is None:
         return None
-    source, weight = [], []
-    for light in filter(casts_shadow, scene.lights):
-        if isinstance(light, DirectionalLight):
-            source.append(direction_to_clip(camera, light.direction))
-        else:
-            source.append(world_to_clip(camera, light.position))
-        weight.append(not isinstance(light, DirectionalLight))
-    edge = outlines(scene.lights, shadows, geometry, topology, points, reached)
-    clip = jnp.stack(source)
+    casting = [light for light in scene.lights if casts_shadow(light)]
+    source = jnp.stack(
+        [
+            direction_to_clip(camera, light.direction)
+            if isinstance(light, DirectionalLight)
+            else world_to_clip(camera, light.position)
+            for light in casting
+        ]
+    )
+    weight = [0 if isinstance(light, DirectionalLight) else 1 for light in casting]
     lit = jnp.stack([part > 0 for part in reached if part is not None])
-    return Cast(edge, lit, clip, jnp.array(weight, clip.dtype))
+    return Cast(
+        edge=outlines(scene.lights, shadows, geometry, topology, points, lit),
+        lit=lit,
+        source=source,
+        weight=jnp.array(weight, source.dtype),
+    )
 
 
 def receive_shadows(world: World, points: Points) -> Reached:

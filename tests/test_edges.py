@@ -10,7 +10,8 @@ import pytest
 
 import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
-from diffrast.edges.blend import Method, View, apply_linear, collect
+from diffrast.edges.blend import Method, View, collect
+from diffrast.edges.derivative import apply_linear
 
 SETTINGS = dr.RenderSettings(height=20, width=24, antialias=True)
 LIGHTS = [dr.DirectionalLight(direction=(-0.4, -0.5, -1.0))]

@@ -49,6 +49,7 @@ ORDER = [
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_lines",
     "diffrast.edges.blend",
+    "diffrast.edges.derivative",
     "diffrast.edges.antialias",
     "diffrast.edges",
     "diffrast.interpolate",

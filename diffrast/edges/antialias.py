@@ -13,16 +13,8 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import (
-    Blended,
-    Glow,
-    Method,
-    Shader,
-    View,
-    apply_linear,
-    collect,
-    linear_zeros,
-)
+from diffrast.edges.blend import Blended, Glow, Method, Shader, View, collect
+from diffrast.edges.derivative import apply_linear, linear_zeros
 from diffrast.edges.pieces import scale_by_depth, to_pixels
 
 CREASES = ("none", "seams", "all")

@@ -1,4 +1,4 @@
-"""Exact areas of pixels beyond edges: the anti-aliased image and its derivative.
+"""Exact areas of pixels beyond edges: the anti-aliased image, and records of what made it.
 
 A piece of an edge from y0 to y1, relative to its pixel's centre, parts off the area beyond it as
 the centre sees it; there the picture shows what is on the other side. With q the position of a
@@ -10,7 +10,7 @@ which adds up exactly over the pieces of any outline. To first order dS is minus
 times the motion of its middle: linear in the positions, without a singularity.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -45,8 +45,8 @@ from diffrast.edges.piercing import (
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look
+from diffrast.raster.fixed_point import over_batches
 
-_ROWS_AT_ONCE = 1024
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 
 Shader = Callable[[Any, Array, list[Array]], list[Array]]
@@ -152,17 +152,9 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
     order, edge_count = choose_edges(edges, volume, view.apart)
     has_background = jnp.any(view.face_image < 0)
 
-    def add_edges(n: Array, total: Blended) -> Blended:
-        slots = n * EDGES_AT_ONCE + jnp.arange(EDGES_AT_ONCE)
+    def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
-            order[jnp.minimum(slots, order.shape[0] - 1)],
-            slots < edge_count,
-            edges,
-            view.faces,
-            pixels,
-            volume,
-            height=height,
-            width=width,
+            edge, exists, edges, view.faces, pixels, volume, height=height, width=width
         )
         ends = jnp.cumsum(segments.parts)
 
@@ -191,9 +183,8 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         start = ends[-1] & 0, no_pieces(segments), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    chunks = (edge_count + EDGES_AT_ONCE - 1) // EDGES_AT_ONCE
     nothing = _nothing(view, method, edge_count & 0)
-    blended = lax.fori_loop(0, chunks, add_edges, nothing)
+    blended = over_batches(order, edge_count, EDGES_AT_ONCE, add_edges, nothing)
     if view.topology.bodies is not None:
         blended = _add_piercing(blended, view, method, pixels, volume, first)
     if view.cast is not None:
@@ -207,15 +198,12 @@ def _add_piercing(
     """Add the lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
-    order, pixel_count = keep_near_crossings(
+    order, count = keep_near_crossings(
         *choose_pixels(view.face_image, bodies), view.faces, pixels, bodies, view.face_image
     )
 
-    def add_pixels(n: Array, total: Blended) -> Blended:
-        slots = n * PIXELS_AT_ONCE + jnp.arange(PIXELS_AT_ONCE)
-        number = order[jnp.minimum(slots, order.shape[0] - 1)]
+    def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = jnp.stack([number % width, number // width])
-        exists = slots < pixel_count
         crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
 
         def add_lines(n: Array, total: Blended) -> Blended:
@@ -224,8 +212,7 @@ def _add_piercing(
         most = jnp.max(jnp.sum(crossings.exists, axis=0))
         return lax.fori_loop(0, most, add_lines, total)
 
-    chunks = (pixel_count + PIXELS_AT_ONCE - 1) // PIXELS_AT_ONCE
-    return lax.fori_loop(0, chunks, add_pixels, total)
+    return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
 
 
 def _add_shadows(
@@ -235,13 +222,10 @@ def _add_shadows(
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     order, count = choose_shadowed(cast)
 
-    def add_pixels(n: Array, total: Blended) -> Blended:
-        slots = n * PIXELS_AT_ONCE + jnp.arange(PIXELS_AT_ONCE)
-        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+    def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = jnp.stack([number % width, number // width % height])
         light = number // (width * height)
         column = pixels.shape[1] - cast.weight.size + light
-        exists = slots < count
         outlines = cross_shadows(
             light, column, pixel, exists, cast, view.faces, pixels, view.topology, view.face_image
         )
@@ -253,14 +237,13 @@ def _add_shadows(
         most = jnp.max(jnp.sum(outlines.exists, axis=0))
         return lax.fori_loop(0, most, add_lines, total)
 
-    chunks = (count + PIXELS_AT_ONCE - 1) // PIXELS_AT_ONCE
-    return lax.fori_loop(0, chunks, add_pixels, total)
+    return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
 
 
 def _nothing(view: View, method: Method, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
     (height, width, channels), dtype = view.image.shape, view.image.dtype
-    rows, own = method.capacity, _cropped(view.image, view.image.shape)
+    rows, own = method.capacity, cropped(view.image, view.image.shape)
     records = Records(
         zero,
         jnp.zeros((rows, 6), jnp.int32) + zero,
@@ -474,150 +457,6 @@ def _along(
     return integral, far - rise
 
 
-# The derivative -----------------------------------------------------------------------------------
-
-
-def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: Any) -> Any:
-    """Add up what each block of rows contributes; `used` masks the rows behind the last."""
-    rows_at_once = min(_ROWS_AT_ONCE, records.jump.shape[0])
-
-    def step(n: Array, total: Any) -> Any:
-        used = n * rows_at_once + jnp.arange(rows_at_once) < records.total
-        rows = [
-            lax.dynamic_slice_in_dim(column, n * rows_at_once, rows_at_once)
-            for column in records[1:]
-        ]
-        return add(used, rows, total)
-
-    rows = jnp.minimum(records.total, records.jump.shape[0])
-    return lax.fori_loop(0, (rows + rows_at_once - 1) // rows_at_once, step, start)
-
-
-def _over_pieces(
-    view: View,
-    method: Method,
-    records: Records,
-    adds: Sequence[Callable[[Array, Any, Any], Any]],
-    start: Any,
-) -> Any:
-    """Add up over all visible pieces, once with each of `adds`.
-
-    The pieces that are not recorded are found again, as many at a time as there are rows.
-    """
-    rounds = jnp.maximum((records.total + method.capacity - 1) // method.capacity, 1)
-
-    def another(n: Array) -> Records:
-        more = collect(view, method, n * method.capacity).records
-        return more._replace(total=more.total - n * method.capacity)
-
-    def step(n: Array, total: Any) -> Any:
-        rows = lax.cond(n % rounds == 0, lambda _: records, another, n % rounds)
-        branches = [lambda total, add=add: _over_rows(rows, add, total) for add in adds]
-        return lax.switch(n // rounds, branches, total)
-
-    return lax.fori_loop(0, len(adds) * rounds, step, start)
-
-
-def _push(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array, added: Array
-) -> Array:
-    """Change of the image with the homogeneous pixel coordinates and with the hard image.
-
-    What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
-    at the next pixel inwards stands for it.
-    """
-    rim = blended.rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
-
-    def average(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        averages, added = total
-        integers, _, weights, _ = rows
-        _, front, _, inner, _, _ = integers.T
-        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return averages.at[front].add(share[:, None] * colors[inner]), added
-
-    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        averages, added = total
-        integers, jump, weights, motion = rows
-        pixel, front, beyond, _, start, end = integers.T
-        here, there = (jnp.where(rim[i, None], averages[i], colors[i]) for i in (front, beyond))
-        moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
-        value = moved[:, None] * jump + weights[:, :1] * (there - here)
-        return averages, added.at[pixel].add(jnp.where(used[:, None], value, 0))
-
-    adds = [add] if method.shader is None else [average, add]
-    start = jnp.zeros_like(colors), added
-    averages, added = _over_pieces(view, method, blended.records, adds, start)
-    return added + _cropped(jnp.where(rim[:, None], averages, colors), view.image.shape)
-
-
-def _pull(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
-) -> tuple[Array, Array]:
-    """The transpose of `_push`, added to `points` and `colors`."""
-    rim = blended.rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
-    own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
-    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
-
-    def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, colors = total
-        integers, jump, weights, motion = rows
-        pixel, front, beyond, _, start, end = integers.T
-        value = jnp.where(used[:, None], cotangent[pixel], 0)
-        along = jnp.sum(value * jump, axis=1)[:, None]
-        points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
-        value = value * weights[:, :1]
-        return points, own.at[beyond].add(value).at[front].add(-value), colors
-
-    def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, colors = total
-        integers, _, weights, _ = rows
-        _, front, _, inner, _, _ = integers.T
-        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return points, own, colors.at[inner].add(share[:, None] * own[front])
-
-    adds = [add] if method.shader is None else [add, average]
-    start = points, own, colors
-    points, own, colors = _over_pieces(view, method, blended.records, adds, start)
-    return points, colors + jnp.where(rim[:, None], 0, own)
-
-
-def _cropped(colors: Array, shape: tuple[int, ...]) -> Array:
+def cropped(colors: Array, shape: tuple[int, ...]) -> Array:
+    """Colours of pixels with a border of one, without it."""
     return colors.reshape(shape)[1:-1, 1:-1].reshape(-1, shape[-1])
-
-
-def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
-    """Zeros that depend on a tangent.
-
-    The system below has to depend on all parts of its right side, and what comes out on all parts
-    of its solution: derivatives of it and of its transpose, again, leave out none.
-    """
-    return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
-
-
-def apply_linear(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array
-) -> Array:
-    """`_push`, written as a linear system so that JAX knows both directions.
-
-    The system is triangular, (points, colors, out - push) = (points, colors, 0), and its solution
-    and that of its transpose are loops over as many pieces as there are.
-    """
-    one_by_one = jax.custom_batching.sequential_vmap
-
-    def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        return x
-
-    def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        push = one_by_one(lambda view, *rest: _push(view, method, *rest))
-        return b[0], b[1], push(view, blended, *b)
-
-    def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        pull = one_by_one(lambda view, *rest: _pull(view, method, *rest))
-        return *pull(view, blended, *b), b[2]
-
-    nothing = linear_zeros(_cropped(colors, view.image.shape).shape, colors)
-    right = points, colors, nothing
-    points, colors, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
-    return out + linear_zeros(out.shape, points) + linear_zeros(out.shape, colors)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
@@ -24,7 +24,7 @@ from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import TOLERANCE, Table, corners_of, edge_values
-from diffrast.raster.fixed_point import CULLED, group_by_class
+from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
 
 PIXELS_AT_ONCE = 64
 _TESTED_AT_ONCE = 512
@@ -92,10 +92,8 @@ def keep_near_crossings(
     """Of chosen pixels those round which the planes of two bodies' faces change places."""
     width = face_image.shape[1] - 2
 
-    def step(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def add(number: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         kept, total = state
-        slots = n * _TESTED_AT_ONCE + jnp.arange(_TESTED_AT_ONCE)
-        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
         row, column = number // width, number % width
         face = stored(pixels_round(face_image, column, row))
         body = stored(jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1))
@@ -108,12 +106,11 @@ def keep_near_crossings(
         changes = ~(jnp.all(apart > 0, axis=1) | jnp.all(apart < 0, axis=1))
         differ = (body[one] >= 0) & (body[other] >= 0) & (body[one] != body[other])
         changes = jnp.any(differ & (changes | unknown[one] | unknown[other]), axis=0)
-        keep = (slots < count) & changes
+        keep = exists & changes
         slot = jnp.where(keep, total + jnp.cumsum(keep) - 1, order.shape[0])
         return kept.at[slot].set(number, mode="drop"), total + jnp.sum(keep)
 
-    chunks = (count + _TESTED_AT_ONCE - 1) // _TESTED_AT_ONCE
-    return lax.fori_loop(0, chunks, step, (order, count & 0))
+    return over_batches(order, count, _TESTED_AT_ONCE, add, (order, count & 0))
 
 
 def _two_bodies(body: Array) -> tuple[Array, Array]:

@@ -17,6 +17,13 @@ Columns = list[Float[Array, "*n"]]
 Table = Float[Array, "4 V"]  # vertices in homogeneous pixel coordinates x, y, z, w
 
 
+def cross_rows(a: Array, b: Array) -> Array:
+    """Cross products of vectors whose three components are rows."""
+    return jnp.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
 def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) -> Array:
     """x, y and w of the three corners of faces, shape (3, 3, *n)."""
     return stored(pixels[jnp.array([0, 1, 3])][:, stored(faces.T[:, jnp.maximum(face, 0)])])
@@ -70,9 +77,7 @@ def barycentrics(values: Columns) -> Columns:
 def inverse_depth_slope(corners: Array, direction: Array) -> Array:
     """Change of 1/w along a direction (2, n) on the screen; 0 on faces seen edge-on."""
     first, one, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    gx = one[1] * other[2] - one[2] * other[1]
-    gy = one[2] * other[0] - one[0] * other[2]
-    gw = one[0] * other[1] - one[1] * other[0]
+    gx, gy, gw = cross_rows(one, other)
     volume = first[0] * gx + first[1] * gy + first[2] * gw
     safe = jnp.where(volume == 0, 1, volume)
     return jnp.where(volume == 0, 0, (gx * direction[0] + gy * direction[1]) / safe)

@@ -25,7 +25,7 @@ from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import Columns, Table, barycentrics, edge_functions
+from diffrast.edges.planes import Columns, Table, barycentrics, cross_rows, edge_functions
 from diffrast.raster.fixed_point import CULLED, group_by_class
 
 _REACH = 0.75  # pixels from the centre: farther than the corners
@@ -132,13 +132,12 @@ def cross_shadows(
     source = place(column_of_light)
     weight = cast.weight[light]
 
-    ground = _face_plane(corners)
-    shadow = _shadow_plane(source, weight, *ends)
-    line = _meet(ground, shadow)
-    normal, foot, steep = stored(_normal_form(line, ground, shadow))
+    ground = _face_plane(corners[:, :, None])
+    shadow = _shadow_plane(source[:, None], weight, *ends)
+    normal, foot, inverse = stored(_line(ground, shadow))
     second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
     lit_on_right = second_on_right != cast.lit[light, row, column]
-    valid = valid & steep
+    valid = valid & (inverse > 0)
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
@@ -153,7 +152,10 @@ def cross_shadows(
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
     sign = jnp.where(ground.offset < 0, -1, 1)
-    limits = [sign * _meet(ground, _end_plane(source, weight, shadow, *e)) for e in _ways(ends)]
+    limits = [
+        sign * _meet(ground, _end_plane(source[:, None], weight, shadow, *way))
+        for way in (ends, ends[::-1])
+    ]
     cut = [jnp.any(meet & chosen, axis=1) for meet in meets]
 
     def inside(at: Array) -> list[Array]:
@@ -198,8 +200,7 @@ def shadow_of(
     start, end = stored((one(outlines.ends[0]), one(outlines.ends[1])))
     source, weight = outlines.source, outlines.weight
     ground, shadow = _face_plane(outlines.corners), _shadow_plane(source, weight, start, end)
-    line = _meet(ground, shadow)
-    normal, foot, _ = _normal_form(line, ground, shadow)
+    normal, foot, inverse = _line(ground, shadow)
     along = jnp.stack([-normal[1], normal[0]])
     low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
@@ -222,10 +223,9 @@ def shadow_of(
         for plane, away in zip(planes, at, strict=True)
     ]
     e, volume = edge_functions(outlines.corners, x, y)
-    steepness = jnp.hypot(line[0], line[1])
-    factor = (high - low) * ground.offset / _nonzero(steepness)
-    turn = factor * shadow.offset / _nonzero(ground.offset) / _nonzero(volume)
-    motions = [-factor * share * shadow.normal for share in shares]
+    per_plane = (high - low) * inverse
+    turn = per_plane * shadow.offset / _nonzero(volume)
+    motions = [-per_plane * ground.offset * share * shadow.normal for share in shares]
     corner_motions = [turn * value * ground.normal for value in e]
     rows = [motions[:2], corner_motions[:2], [corner_motions[2], motions[2]]]
     motion = jnp.stack([jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows])
@@ -256,12 +256,6 @@ def _dot(a: Array, b: Array) -> Array:
     return jnp.sum(a * b, axis=0)
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
 def _nonzero(value: Array) -> Array:
     return jnp.where(value == 0, 1, value)
 
@@ -280,46 +274,43 @@ def _through(normal: Array, place: Array) -> _Plane:
 
 def _face_plane(corners: Float[Array, "3 3 *n"]) -> _Plane:
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    return _through(_cross(b - a, c - a), a)
+    return _through(cross_rows(b - a, c - a), a)
 
 
 def _shadow_plane(source: Array, weight: Array, start: Array, end: Array) -> _Plane:
-    to_light = source[:, None] - weight * start if start.ndim == 3 else source - weight * start
-    return _through(_cross(to_light, end - start), start)
+    return _through(cross_rows(source - weight * start, end - start), start)
 
 
 def _end_plane(source: Array, weight: Array, shadow: _Plane, start: Array, end: Array) -> _Plane:
     """The plane through light and start at right angles to the shadow's; positive at the end."""
-    to_light = source[:, None] - weight * start if start.ndim == 3 else source - weight * start
-    plane = _through(_cross(shadow.normal, to_light), start)
+    plane = _through(cross_rows(shadow.normal, source - weight * start), start)
     sign = jnp.where(_dot(plane.normal, end - start) < 0, -1, 1)
     return _Plane(sign * plane.normal, sign * plane.offset)
 
 
 def _edge_plane(shadow: _Plane, start: Array, end: Array) -> _Plane:
     """The plane through the edge at right angles to the shadow's."""
-    return _through(_cross(end - start, shadow.normal), start)
-
-
-def _ways(ends: list[Array]) -> list[tuple[Array, Array]]:
-    return [(ends[0], ends[1]), (ends[1], ends[0])]
+    return _through(cross_rows(end - start, shadow.normal), start)
 
 
 def _meet(ground: _Plane, plane: _Plane) -> Float[Array, "3 *n"]:
     """The line a x + b y + c = 0 on the screen where planes meet: (a, b, c)."""
-    normal = ground.normal[:, None] if plane.normal.ndim == 3 else ground.normal
-    return ground.offset * plane.normal - plane.offset * normal
+    return ground.offset * plane.normal - plane.offset * ground.normal
 
 
-def _normal_form(line: Array, ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
-    """A line's unit normal and its point next to the pixel's centre; and whether it is known."""
+def _line(ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
+    """Where planes meet on the screen: unit normal, and point next to the pixel's centre.
+
+    Also the factor that makes distances of what `_meet` tells, 0 where rounding leaves no line.
+    """
+    line = _meet(ground, shadow)
     steepness = jnp.hypot(line[0], line[1])
     size = jnp.max(jnp.abs(shadow.normal[:2]), axis=0) * jnp.abs(ground.offset)
     size = size + jnp.max(jnp.abs(ground.normal[:2]), axis=0) * jnp.abs(shadow.offset)
     steep = steepness > _ROUNDINGS * jnp.finfo(line.dtype).eps * size
     inverse = 1 / jnp.where(steep, steepness, 1)
     normal = line[:2] * inverse
-    return normal, -line[2] * inverse * normal, steep
+    return normal, -line[2] * inverse * normal, jnp.where(steep, inverse, 0)
 
 
 def _same_place(end: Array, others: list[Array]) -> Array:

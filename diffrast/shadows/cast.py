@@ -1,10 +1,10 @@
 """The shadows of all lights of a scene."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -12,7 +12,9 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, ShiningLight, casts_shadow
-from diffrast.shadows.lit import Rays, lit, turned_to
+from diffrast.linalg import dot
+from diffrast.mesh import face_normals
+from diffrast.shadows.lit import Rays, lit
 from diffrast.shadows.maps import Pictures, Plan, plan, take
 from diffrast.shadows.views import LightView, Seen, light_view, see, sides, source
 
@@ -30,6 +32,7 @@ class Shadows(NamedTuple):
     """What all lights that cast shadows see."""
 
     views: tuple[LightView, ...]
+    turned: tuple[Bool[Array, " faces"], ...]  # whether faces turn their outside to the light
     windows: tuple[Float[Array, "sides 4"], ...]
     pictures: tuple[Pictures, ...]  # one for each resolution, in ascending order
 
@@ -49,7 +52,8 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
     casting = [light for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
         views = [light_view(light, geometry.positions) for light in casting]
-        regards = _regards(casting, views, geometry, points)
+        turned = [_turned_to(*both, geometry) for both in zip(casting, views, strict=True)]
+        regards = _regards(casting, views, turned, geometry, points)
         windows, plans = zip(
             *(
                 plan(light, view, seen, asked)
@@ -62,7 +66,7 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
             joined = zip(*(plans[i] for i in members), strict=True)
             together = Plan(*(jnp.concatenate(column) for column in joined))
             pictures.append(take(together, geometry, size))
-        shadows = Shadows(tuple(views), windows, tuple(pictures))
+        shadows = Shadows(tuple(views), tuple(turned), windows, tuple(pictures))
         return shadows, _reached(lights, shadows, geometry, points, regards)
 
 
@@ -77,19 +81,14 @@ def receive(
     lights, geometry, points = lax.stop_gradient((lights, geometry, points))
     casting = [light for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
-        regards = _regards(casting, list(shadows.views), geometry, points)
+        regards = _regards(casting, shadows.views, shadows.turned, geometry, points)
         return _reached(lights, shadows, geometry, points, regards)
 
 
-def terminators(
-    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, edges: Edges
-) -> Bool[Array, " edges"]:
+def terminators(shadows: Shadows, edges: Edges) -> Bool[Array, " edges"]:
     """Edges between a face that is turned to a light with shadows and one that is not."""
-    lights, geometry = lax.stop_gradient((lights, geometry))
-    casting = [light for light in lights if casts_shadow(light)]
     found = jnp.zeros_like(edges.seam)
-    for light, view in zip(casting, shadows.views, strict=True):
-        turned = turned_to(source(light, view), geometry, np.arange(geometry.faces.shape[0]))
+    for turned in shadows.turned:
         one, other = turned[jnp.maximum(edges.faces, 0)].T
         found = found | (one != other)
     return found & (edges.faces[:, 1] >= 0)
@@ -102,16 +101,30 @@ def by_resolution(lights: list[ShiningLight]) -> list[tuple[int, list[int]]]:
 
 
 def _regards(
-    lights: list[ShiningLight], views: list[LightView], geometry: Geometry, points: Points
+    lights: list[ShiningLight],
+    views: Sequence[LightView],
+    turned: Sequence[Bool[Array, " faces"]],
+    geometry: Geometry,
+    points: Points,
 ) -> list[_Regard]:
     position = at_points(geometry.positions, geometry, points)
     visible = jnp.maximum(points.face, 0)
     regards = []
-    for light, view in zip(lights, views, strict=True):
+    for light, view, outside in zip(lights, views, turned, strict=True):
         seen = stored(see(light, view, position))
-        turned = turned_to(source(light, view), geometry, np.arange(geometry.faces.shape[0]))
-        regards.append(_Regard(seen, seen.inside & turned[visible] & (points.face >= 0)))
+        regards.append(_Regard(seen, seen.inside & outside[visible] & (points.face >= 0)))
     return regards
+
+
+def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " faces"]:
+    """Whether the light is on that side of faces which the normals at their corners point to."""
+    normal = face_normals(geometry.positions, geometry.faces_outward)
+    corner = geometry.positions[geometry.faces_outward[:, 0]]
+    place = source(light, view)
+    inside_out = jnp.zeros(normal.shape[0], bool)
+    if geometry.normals is not None:
+        inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces], axis=1)) < 0
+    return jnp.where(inside_out, -1, 1) * dot(normal, place[:3] - place[3] * corner) > 0
 
 
 def _reached(

@@ -11,16 +11,14 @@ nine texels may show, are good to half a texel.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
-from jax.typing import ArrayLike
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
+from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
-from diffrast.linalg import dot
-from diffrast.mesh import face_normals
-from diffrast.raster.fixed_point import CULLED, group_by_class
+from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
 from diffrast.shadows.maps import Pictures
 
 _AT_ONCE = 512
@@ -69,29 +67,12 @@ def lit(pictures: Pictures, geometry: Geometry, rays: Rays) -> Float[Array, " n"
     bright = rays.asked & (rays.key >= depth - error - rounding)
     order, starts = group_by_class(jnp.where(rays.asked & jnp.isinf(error), 0, CULLED))
 
-    def look_closer(n: Array, bright: Array) -> Array:
-        slots = n * _AT_ONCE + jnp.arange(_AT_ONCE)
-        chosen = order[jnp.minimum(slots, order.shape[0] - 1)]
+    def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
         some = stored(Rays(*(column[..., chosen] for column in rays)))
-        place = jnp.where(slots < starts[1], chosen, bright.size)
+        place = jnp.where(exists, chosen, bright.size)
         return bright.at[place].set(~_blocked(pictures, geometry, some), mode="drop")
 
-    chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
-    return lax.fori_loop(0, chunks, look_closer, bright).astype(key.dtype)
-
-
-def turned_to(source: Array, geometry: Geometry, face: ArrayLike) -> Bool[Array, " n"]:
-    """Whether a light is on that side of faces which the normals at their corners point to.
-
-    `source` is the light as a homogeneous point, (4,), or one for each face, (n, 4).
-    """
-    normal = face_normals(geometry.positions, geometry.faces_outward[face])
-    corner = geometry.positions[geometry.faces_outward[face, 0]]
-    to_light = source[..., :3] - source[..., 3:] * corner
-    inside_out = jnp.zeros(normal.shape[0], bool)
-    if geometry.normals is not None:
-        inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces[face]], axis=1)) < 0
-    return jnp.where(inside_out, -1, 1) * dot(normal, to_light) > 0
+    return over_batches(order, starts[1], _AT_ONCE, look_closer, bright).astype(key.dtype)
 
 
 def _texel_of(pictures: Pictures, rays: Rays) -> _Texel:
@@ -113,6 +94,11 @@ def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, 
     return (jnp.max(nearby.stops, axis=0) > 0) | _hidden_by_small(pictures, rays, nearby)
 
 
+def face_corners(geometry: Geometry, face: Int[Array, "*n"]) -> Float[Array, "3 3 *n"]:
+    """x, y and z by rows of the three corners of faces."""
+    return stored(geometry.positions.T[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
+
+
 def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
     """The faces at the 3×3 texels round rays, and which of them stop these."""
     texel = _texel_of(pictures, rays)
@@ -121,13 +107,7 @@ def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
     row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
     column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
     around = stored(pictures.face[rays.picture, row, column])
-    table = geometry.positions.T
-
-    def corners_of(face: Array) -> Array:
-        """The corners' x, y and z, shape (3, 3 corners, *face)."""
-        return stored(table[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
-
-    own, others = corners_of(rays.face), corners_of(around)
+    own, others = face_corners(geometry, rays.face), face_corners(geometry, around)
     origin = own[:, 0]
     total = jnp.sum(rays.barycentrics, axis=0)
     shares = rays.barycentrics / jnp.where(total == 0, 1, total)
@@ -165,12 +145,12 @@ def _hidden_by_small(pictures: Pictures, rays: Rays, nearby: Nearby) -> Bool[Arr
 def _stops(corners: Array, ray: Array, *, endless: Array) -> Array:
     """Positive where faces, given from the beginning of rays, stop them before their end."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = _cross(b - a, c - a)
+    normal = cross_rows(b - a, c - a)
     along, distance = dot_columns(normal, ray), dot_columns(normal, a)
     sign = jnp.where(along < 0, -1, 1)
     inside = along != 0
     for start, end in ((a, b), (b, c), (c, a)):
-        inside = inside & (sign * dot_columns(ray, _cross(start, end)) >= 0)
+        inside = inside & (sign * dot_columns(ray, cross_rows(start, end)) >= 0)
     rounding = dot_columns(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
     rounding = rounding * (_ROUNDINGS * jnp.finfo(corners.dtype).eps)
     before = sign * distance
@@ -194,7 +174,7 @@ def _slopes(pictures: Pictures, rays: Rays, corners: Array) -> tuple[list[Array]
 
     def determinant(*columns: int) -> Array:
         a, b, c = (row[jnp.array(columns)] for row in (first, one, other))
-        return dot_columns(a, _cross(b, c))
+        return dot_columns(a, cross_rows(b, c))
 
     volume = determinant(0, 1, 2)
     inverse = jnp.where(volume == 0, 0, 1) / jnp.where(volume == 0, 1, volume)
@@ -203,9 +183,3 @@ def _slopes(pictures: Pictures, rays: Rays, corners: Array) -> tuple[list[Array]
     x, y = (column / jnp.where(before, w, 1) for column in (x, y))
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     return slopes, jnp.where(before, jnp.abs(area), jnp.inf)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

@@ -20,13 +20,13 @@ from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
 from diffrast.edges.planes import edge_functions
-from diffrast.geometry import Geometry, Points
+from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, casts_shadow
-from diffrast.raster.fixed_point import CULLED, group_by_class
-from diffrast.shadows.cast import Reached, Shadows, by_resolution
-from diffrast.shadows.lit import Rays, faces_near, turned_to
+from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
+from diffrast.shadows.cast import Shadows, by_resolution
+from diffrast.shadows.lit import Rays, face_corners, faces_near
 from diffrast.shadows.maps import Pictures
-from diffrast.shadows.views import sides
+from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
 _STEPS = 64  # from face to face
@@ -37,6 +37,7 @@ class _Lamps(NamedTuple):
 
     first: Int[np.ndarray, " lights"]  # picture of each
     cube: Bool[np.ndarray, " lights"]  # six pictures, the sides of a cube
+    turned: Bool[Array, "lights faces"]  # faces that turn their outside to each
 
 
 def outlines(
@@ -45,7 +46,7 @@ def outlines(
     geometry: Geometry,
     topology: Topology,
     points: Points,
-    reached: Reached,
+    lit: Bool[Array, "lights height width"],
 ) -> Int[Array, "lights 2 height width"]:
     """For each light with shadows and each pixel the edges between it and the next ones.
 
@@ -55,22 +56,25 @@ def outlines(
         geometry: of the scene.
         topology: of its faces.
         points: what each pixel sees.
-        reached: which lights reach it.
+        lit: whether each of the lights with shadows reaches it.
 
     Returns:
         3 * face + corner, the edge of a face opposite to a corner, or -1: between the pixel and
         that on its right, and that below it.
     """
     casting = [light for light in lights if casts_shadow(light)]
-    bright = [part > 0 for part in reached if part is not None]
     geometry, points = lax.stop_gradient((geometry, points))
     found: dict[int, Array] = {}
     with jax.named_scope("outlines"):
         for pictures, (_, members) in zip(shadows.pictures, by_resolution(casting), strict=True):
             counts = [sides(casting[i]) for i in members]
-            lamps = _Lamps(np.cumsum([0, *counts[:-1]]), np.array(counts) > 1)
-            lit = jnp.stack([bright[i] for i in members])
-            edges = _between_pixels(lamps, pictures, geometry, topology, points, lit)
+            lamps = _Lamps(
+                first=np.cumsum([0, *counts[:-1]]),
+                cube=np.array(counts) > 1,
+                turned=jnp.stack([shadows.turned[i] for i in members]),
+            )
+            own_lit = lit[np.array(members)]
+            edges = _between_pixels(lamps, pictures, geometry, topology, points, own_lit)
             found.update(zip(members, edges, strict=True))
     return jnp.stack([found[i] for i in range(len(casting))])
 
@@ -96,21 +100,18 @@ def _between_pixels(
     face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
     barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
 
-    def look(n: Array, edges: Array) -> Array:
-        slots = n * _AT_ONCE + jnp.arange(_AT_ONCE)
-        number = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+    def look(number: Array, exists: Array, edges: Array) -> Array:
         lamp, at = number // (2 * height * width), number % (height * width)
         next_at = at + jnp.where(number // (height * width) % 2 == 0, 1, width)
         is_lit = bright[lamp, at]
         ends = jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
         dark, bright_end = (Points(face[i], list(barycentrics[:, i]), at) for i in stored(ends))
         edge = _edge_between(lamps, lamp, pictures, geometry, topology, dark, bright_end)
-        place = jnp.where(slots < starts[1], number, edges.size)
+        place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
-    chunks = (starts[1] + _AT_ONCE - 1) // _AT_ONCE
     none = jnp.full(pairs.size, -1, jnp.int32) + (starts[1] & 0)
-    return lax.fori_loop(0, chunks, look, none).reshape(pairs.shape)
+    return over_batches(order, starts[1], _AT_ONCE, look, none).reshape(pairs.shape)
 
 
 def _edge_between(
@@ -123,16 +124,10 @@ def _edge_between(
     bright: Points,
 ) -> Int[Array, " n"]:
     """The edge whose shadow passes between points in the dark and others in the light."""
-    table = geometry.positions.T
-
-    def corners_of(face: Array) -> Array:
-        """x, y and z of faces' corners, shape (3, 3 corners, *face)."""
-        return stored(table[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
-
-    def place(points: Points) -> Array:
-        return jnp.sum(corners_of(points.face) * jnp.stack(points.barycentrics), axis=1)
-
-    at_dark, at_bright = stored((place(dark), place(bright)))
+    at_dark, at_bright = (
+        stored(jnp.stack(at_points(geometry.positions, geometry, points)))
+        for points in (dark, bright)
+    )
     picture = stored(_picture(lamps, lamp, at_dark - pictures.plan.origin[lamps.first][lamp].T))
     origin = stored(pictures.plan.origin[picture].T)
     matrix = stored(jnp.moveaxis(pictures.plan.matrix[picture][:, :3], 0, 2))  # (x y w, 4, n)
@@ -158,23 +153,23 @@ def _edge_between(
         asked=zero == 0,
     )
     nearby = faces_near(pictures, geometry, rays)
-    part, _, _ = _leaves(stored(seen(corners_of(nearby.face))), ends)
+    part, _, _ = _leaves(stored(seen(nearby.corners)), ends)
     part = stored(jnp.where((nearby.stops > 0) & (part < 2), part, -1))
     farthest = jnp.max(part, axis=0)
     nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
     row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
-    face = picked(nearby.face, row)
-    face = jnp.where(turned_to(pictures.plan.source[picture], geometry, dark.face), face, -1)
-    return _follow(face, topology.neighbors, lambda face: seen(corners_of(face)), ends)
+    face = jnp.where(lamps.turned[lamp, dark.face], picked(nearby.face, row), -1)
+
+    def corners_of(face: Array) -> Array:
+        return seen(face_corners(geometry, face))
+
+    return _follow(face, topology.neighbors, corners_of, ends)
 
 
 def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"]) -> Array:
     """Which picture shows points, given from their lights."""
-    size = jnp.abs(offset)
-    first = (size[0] >= size[1]) & (size[0] >= size[2])
-    axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
-    side = 2 * axis + (picked(offset, axis) < 0)
-    return jnp.asarray(lamps.first)[lamp] + jnp.where(jnp.asarray(lamps.cube)[lamp], side, 0)
+    side = jnp.where(jnp.asarray(lamps.cube)[lamp], cube_side(list(offset)), 0)
+    return jnp.asarray(lamps.first)[lamp] + side
 
 
 def _leaves(

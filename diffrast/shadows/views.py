@@ -74,10 +74,8 @@ def see(light: ShiningLight, view: LightView, position: Columns) -> Seen:
     offset = [position[i] - view.origin[i] for i in range(3)]
     side = jnp.zeros(offset[0].shape, jnp.int32)
     if isinstance(light, PointLight):
-        size = [jnp.abs(component) for component in offset]
-        first = (size[0] >= size[1]) & (size[0] >= size[2])
-        axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
-        side = 2 * axis + (_of_axis(axis, offset) < 0)
+        side = cube_side(offset)
+        axis = side // 2
         across = [_of_axis(axis, [*offset[k:], *offset[:k]]) for k in (1, 2)]
         x, y, z = *across, jnp.abs(_of_axis(axis, offset))
     else:
@@ -91,6 +89,14 @@ def see(light: ShiningLight, view: LightView, position: Columns) -> Seen:
         reach = jnp.tan(light.cutoff)
         inside = inside & (x * x + y * y < reach * reach)
     return Seen(side, x, y, inverse, inverse, inside)
+
+
+def cube_side(offset: Columns) -> Int[Array, "*size"]:
+    """Which of a point light's pictures shows points: the axes by twos, forwards and backwards."""
+    size = [jnp.abs(component) for component in offset]
+    first = (size[0] >= size[1]) & (size[0] >= size[2])
+    axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
+    return 2 * axis + (_of_axis(axis, offset) < 0)
 
 
 def source(light: ShiningLight, view: LightView) -> Float[Array, "4"]:

@@ -1,0 +1,158 @@
+"""The derivative of the anti-aliased image, as a linear map in both directions.
+
+It is a sum over the recorded pieces: of the colour's jump times the area's motion, linear in the
+positions, and of the area times the change of the colours on its two sides.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from diffrast.edges.blend import Blended, Method, Records, View, collect, cropped
+
+_ROWS_AT_ONCE = 1024
+
+
+def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: Any) -> Any:
+    """Add up what each block of rows contributes; `used` masks the rows behind the last."""
+    rows_at_once = min(_ROWS_AT_ONCE, records.jump.shape[0])
+
+    def step(n: Array, total: Any) -> Any:
+        used = n * rows_at_once + jnp.arange(rows_at_once) < records.total
+        rows = [
+            lax.dynamic_slice_in_dim(column, n * rows_at_once, rows_at_once)
+            for column in records[1:]
+        ]
+        return add(used, rows, total)
+
+    rows = jnp.minimum(records.total, records.jump.shape[0])
+    return lax.fori_loop(0, (rows + rows_at_once - 1) // rows_at_once, step, start)
+
+
+def _over_pieces(
+    view: View,
+    method: Method,
+    records: Records,
+    adds: Sequence[Callable[[Array, Any, Any], Any]],
+    start: Any,
+) -> Any:
+    """Add up over all visible pieces, once with each of `adds`.
+
+    The pieces that are not recorded are found again, as many at a time as there are rows.
+    """
+    rounds = jnp.maximum((records.total + method.capacity - 1) // method.capacity, 1)
+
+    def another(n: Array) -> Records:
+        more = collect(view, method, n * method.capacity).records
+        return more._replace(total=more.total - n * method.capacity)
+
+    def step(n: Array, total: Any) -> Any:
+        rows = lax.cond(n % rounds == 0, lambda _: records, another, n % rounds)
+        branches = [lambda total, add=add: _over_rows(rows, add, total) for add in adds]
+        return lax.switch(n // rounds, branches, total)
+
+    return lax.fori_loop(0, len(adds) * rounds, step, start)
+
+
+def _push(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array, added: Array
+) -> Array:
+    """Change of the image with the homogeneous pixel coordinates and with the hard image.
+
+    What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
+    at the next pixel inwards stands for it.
+    """
+    rim = blended.rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
+
+    def average(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        averages, added = total
+        integers, _, weights, _ = rows
+        _, front, _, inner, _, _ = integers.T
+        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
+        return averages.at[front].add(share[:, None] * colors[inner]), added
+
+    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        averages, added = total
+        integers, jump, weights, motion = rows
+        pixel, front, beyond, _, start, end = integers.T
+        here, there = (jnp.where(rim[i, None], averages[i], colors[i]) for i in (front, beyond))
+        moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
+        value = moved[:, None] * jump + weights[:, :1] * (there - here)
+        return averages, added.at[pixel].add(jnp.where(used[:, None], value, 0))
+
+    adds = [add] if method.shader is None else [average, add]
+    start = jnp.zeros_like(colors), added
+    averages, added = _over_pieces(view, method, blended.records, adds, start)
+    return added + cropped(jnp.where(rim[:, None], averages, colors), view.image.shape)
+
+
+def _pull(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
+) -> tuple[Array, Array]:
+    """The transpose of `_push`, added to `points` and `colors`."""
+    rim = blended.rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
+    own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
+    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
+
+    def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        points, own, colors = total
+        integers, jump, weights, motion = rows
+        pixel, front, beyond, _, start, end = integers.T
+        value = jnp.where(used[:, None], cotangent[pixel], 0)
+        along = jnp.sum(value * jump, axis=1)[:, None]
+        points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
+        value = value * weights[:, :1]
+        return points, own.at[beyond].add(value).at[front].add(-value), colors
+
+    def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        points, own, colors = total
+        integers, _, weights, _ = rows
+        _, front, _, inner, _, _ = integers.T
+        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
+        return points, own, colors.at[inner].add(share[:, None] * own[front])
+
+    adds = [add] if method.shader is None else [add, average]
+    start = points, own, colors
+    points, own, colors = _over_pieces(view, method, blended.records, adds, start)
+    return points, colors + jnp.where(rim[:, None], 0, own)
+
+
+def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
+    """Zeros that depend on a tangent.
+
+    The system below has to depend on all parts of its right side, and what comes out on all parts
+    of its solution: derivatives of it and of its transpose, again, leave out none.
+    """
+    return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
+
+
+def apply_linear(
+    view: View, method: Method, blended: Blended, points: Array, colors: Array
+) -> Array:
+    """`_push`, written as a linear system so that JAX knows both directions.
+
+    The system is triangular, (points, colors, out - push) = (points, colors, 0), and its solution
+    and that of its transpose are loops over as many pieces as there are.
+    """
+    one_by_one = jax.custom_batching.sequential_vmap
+
+    def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        return x
+
+    def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        push = one_by_one(lambda view, *rest: _push(view, method, *rest))
+        return b[0], b[1], push(view, blended, *b)
+
+    def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        pull = one_by_one(lambda view, *rest: _pull(view, method, *rest))
+        return *pull(view, blended, *b), b[2]
+
+    nothing = linear_zeros(cropped(colors, view.image.shape).shape, colors)
+    right = points, colors, nothing
+    points, colors, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
+    return out + linear_zeros(out.shape, points) + linear_zeros(out.shape, colors)
