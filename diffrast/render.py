@@ -169,10 +169,11 @@ def _with_edges(
 ) -> Array:
     geometry = world.geometry
     topology = scene_topology(world.scene)
+    cast = cast_outlines(world, topology, pixels, reached)
+    apart = apart_edges(geometry, topology.edges, settings.shading)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
-    apart = apart_edges(geometry, topology.edges, settings.shading)
-    if world.shadows is not None:
+    elif world.shadows is not None:
         apart = apart | terminators(world.shadows, topology.edges)
     view = View(
         positions_clip=positions_clip,
@@ -184,7 +185,7 @@ def _with_edges(
         image=image,
         background=background,
         scene=world,
-        cast=cast_outlines(world, topology, pixels, reached),
+        cast=cast,
     )
     return antialias_image(
         view,

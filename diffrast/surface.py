@@ -67,6 +67,7 @@ def cast_outlines(
     return Cast(
         edge=outlines(scene.lights, shadows, geometry, topology, points, lit),
         lit=lit,
+        patches=topology.patches,
         source=source,
         weight=jnp.array(weight, source.dtype),
     )

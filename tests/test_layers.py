@@ -35,6 +35,7 @@ ORDER = [
     "diffrast.files.bezier",
     "diffrast.files",
     "diffrast._stored",
+    "diffrast._selection",
     "diffrast.raster.fixed_point",
     "diffrast.raster.edge_functions",
     "diffrast.raster.coverage",

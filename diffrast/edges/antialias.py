@@ -15,7 +15,8 @@ from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, View, collect
 from diffrast.edges.derivative import apply_linear, linear_zeros
-from diffrast.edges.pieces import scale_by_depth, to_pixels
+from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
+from diffrast.edges.shadow_lines import with_lights
 
 CREASES = ("none", "seams", "all")
 
@@ -139,10 +140,13 @@ def antialias_image(
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = max(4096, 1024 * math.ceil(height * width / 8 / 1024))
     method = Method(shader, glow, cull_backfaces, capacity)
-    scale = scale_by_depth(view.positions_clip)
+    depth = depth_of(view.positions_clip)
+    scale = scale_by_depth(depth, view.positions_clip)
     positions_clip = view.positions_clip * scale[:, None]
     if view.cast is not None:
-        positions_clip = jnp.concatenate([positions_clip, view.cast.source])
+        cast, rows = with_lights(view.cast, depth)
+        positions_clip = jnp.concatenate([positions_clip, rows])
+        view = view._replace(cast=cast)
     view = view._replace(positions_clip=positions_clip, scale=scale)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
 

@@ -19,6 +19,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import over_batches, prefix_sum
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.pieces import (
@@ -45,7 +46,6 @@ from diffrast.edges.piercing import (
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look
-from diffrast.raster.fixed_point import over_batches
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 
@@ -66,7 +66,7 @@ class View(NamedTuple):
     background: Float[Array, "*size channels"]  # one colour, or a picture like `image`
     scene: Any  # passed on to the shader
     scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
-    cast: Cast | None = None  # shadows; then the last of `positions_clip` are the lights
+    cast: Cast | None = None  # shadows; then lights and their weights follow the positions
 
 
 class Method(NamedTuple):
@@ -156,7 +156,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         segments = clip_edges(
             edge, exists, edges, view.faces, pixels, volume, height=height, width=width
         )
-        ends = jnp.cumsum(segments.parts)
+        ends = prefix_sum(segments.parts)
 
         def add_pieces(state: tuple[Array, Pieces, Blended]) -> tuple[Array, Pieces, Blended]:
             next_piece, left, total = state
@@ -225,13 +225,14 @@ def _add_shadows(
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = jnp.stack([number % width, number // width % height])
         light = number // (width * height)
-        column = pixels.shape[1] - cast.weight.size + light
+        weight_of_light = pixels.shape[1] - cast.weight.size + light
+        column = weight_of_light - cast.weight.size
         outlines = cross_shadows(
-            light, column, pixel, exists, cast, view.faces, pixels, view.topology, view.face_image
+            light, column, pixel, exists, cast, view.faces, pixels, view.face_image
         )
 
         def add_lines(n: Array, total: Blended) -> Blended:
-            line = shadow_of(outlines, n, column, pixel, view.faces)
+            line = shadow_of(outlines, n, column, weight_of_light, pixel, view.faces)
             return _with_shadow(total, view, method, pixel, light, line, first)
 
         most = jnp.max(jnp.sum(outlines.exists, axis=0))
@@ -351,7 +352,8 @@ def _with_line(
     total, own = _with_values(total, view, pixel, line.used, value, jnp.stack([right, left]))
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
-    records = _with_lines(total.records, line.used, own, places, jump, area, corners, motion, first)
+    use = jnp.stack([line.used] * 3)
+    records = _with_lines(total.records, use, own, places, jump, area, corners, motion, first)
     return total._replace(records=records)
 
 
@@ -366,6 +368,7 @@ def _with_shadow(
 ) -> Blended:
     """Add one line in each pixel across which a light begins."""
     assert method.glow is not None
+    assert view.cast is not None
     area = _area(line.begin, line.end)
     glow = jnp.stack(method.glow(view.scene, light, line.face, line.barycentrics), axis=-1)
     jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
@@ -375,8 +378,9 @@ def _with_shadow(
     held = jnp.stack([own, own + to_other])
     total, number = _with_values(total, view, pixel, line.used, value, held)
     places = [_place(view, pixel, look) for look in line.look]
+    use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
     records = _with_lines(
-        total.records, line.used, number, places, jump, area, line.vertices, line.motion, first
+        total.records, use, number, places, jump, area, line.vertices, line.motion, first
     )
     return total._replace(records=records)
 
@@ -392,7 +396,7 @@ def _with_lines(
     motion: Array,
     first: ArrayLike,
 ) -> Records:
-    """Record lines that move with six vertices, as three rows each: two vertices in every row."""
+    """Record lines that move with more vertices, as several rows each: two in every row."""
     rows = [
         (
             jnp.stack([pixel, places[1], places[0], places[0], *vertices[i]], axis=-1),
@@ -400,10 +404,10 @@ def _with_lines(
             jnp.stack([area * (i == 0), jnp.zeros_like(area)], axis=-1),
             stored(motion[i].T),
         )
-        for i in range(3)
+        for i in range(len(used))
     ]
     joined = tuple(jnp.concatenate(column) for column in zip(*rows, strict=True))
-    return _with_rows(records, jnp.tile(used, 3), joined, first)
+    return _with_rows(records, used.reshape(-1), joined, first)
 
 
 def _with_values(
@@ -421,12 +425,13 @@ def _with_values(
 def _with_rows(records: Records, used: Array, rows: tuple[Array, ...], first: ArrayLike) -> Records:
     """Write rows behind those in use, as far as there is room."""
     capacity = records.jump.shape[0]
-    slot = records.total + jnp.cumsum(used) - 1 - first
+    ends = prefix_sum(used.astype(jnp.int32))
+    slot = records.total + ends - 1 - first
     slot = jnp.where(used & (slot >= 0), slot, capacity)
     columns = (
         old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
     )
-    return Records(records.total + jnp.sum(used), *columns)
+    return Records(records.total + ends[-1], *columns)
 
 
 def _along(

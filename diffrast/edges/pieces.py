@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import compacted, prefix_sum, selected
 from diffrast._stored import stored
 from diffrast._topology import Edges
-from diffrast.raster.fixed_point import CULLED, group_by_class
 
 EDGES_AT_ONCE = 512
 PIECES_AT_ONCE = 512
@@ -57,22 +57,43 @@ def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> F
     return jnp.stack([(x + w) * (width / 2), (w - y) * (height / 2), z, w])
 
 
-def scale_by_depth(positions_clip: Float[Array, "V 4"]) -> Float[Array, " V"]:
-    """Factors of homogeneous coordinates that make 1/w tell what is nearer: 1 under perspective.
+class Depth(NamedTuple):
+    """How a parallel projection, which has the same w everywhere, tells what is nearer.
 
-    A parallel projection has the same w everywhere. With these factors, which move nothing on the
-    screen, its 1/w grows from 1 to 2 (times as much) from the farthest vertex to the nearest; on a
-    plane it stays linear on the screen. Differentiable in z.
+    Homogeneous coordinates divided by `weight`, which is linear in them and moves nothing on the
+    screen, have a 1/w that grows from 1 to 2 (times as much) from the farthest vertex to the
+    nearest; on a plane it stays linear on the screen. So the weight takes the place that the
+    constant 1 has under perspective.
     """
-    z, w = positions_clip[:, 2], positions_clip[:, 3]
+
+    parallel: Bool[Array, ""]
+    nearest: Float[Array, ""]  # z
+    slope: Float[Array, ""]  # one over the range of z
+    inverse_w: Float[Array, ""]
+
+    def weight(self, positions_clip: Float[Array, "V 4"]) -> Float[Array, " V"]:
+        """Of points, under parallel projection. Differentiable."""
+        z, w = positions_clip[:, 2], positions_clip[:, 3] * self.inverse_w
+        return 2 * w - (z - self.nearest * w) * self.slope
+
+
+def depth_of(positions_clip: Float[Array, "V 4"]) -> Depth:
+    """How these vertices tell what is nearer. Not differentiable."""
+    z, w = lax.stop_gradient(positions_clip[:, 2:].T)
     finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
-    parallel = jnp.all((w == jnp.max(jnp.where(finite, w, -jnp.inf))) | ~finite)
-    fixed = lax.stop_gradient(z)
-    nearest = jnp.min(jnp.where(finite, fixed, jnp.inf))
-    depth = jnp.max(jnp.where(finite, fixed, -jnp.inf)) - nearest
-    known = parallel & (depth > 0) & finite
-    far = jnp.where(known, z - nearest, 0) / jnp.where(known, depth, 1)
-    return jnp.where(known, 1 / (2 - far), 1)
+    common = jnp.max(jnp.where(finite, w, -jnp.inf))
+    nearest = jnp.min(jnp.where(finite, z, jnp.inf))
+    range_ = jnp.max(jnp.where(finite, z, -jnp.inf)) - nearest
+    parallel = jnp.all((w == common) | ~finite) & (range_ > 0) & (common > 0)
+    slope, inverse_w = 1 / jnp.where(parallel, jnp.stack([range_, common]), 1)
+    return Depth(parallel, jnp.where(parallel, nearest, 0), slope, inverse_w)
+
+
+def scale_by_depth(depth: Depth, positions_clip: Float[Array, "V 4"]) -> Float[Array, " V"]:
+    """Factors of homogeneous coordinates that make 1/w tell what is nearer: 1 under perspective."""
+    known = depth.parallel & jnp.all(jnp.isfinite(positions_clip), axis=1)
+    safe = jnp.where(known[:, None], positions_clip, 0)
+    return 1 / jnp.where(known, depth.weight(safe), 1)
 
 
 def facing(pixels: Float[Array, "4 V"], faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
@@ -118,8 +139,7 @@ def choose_edges(
     """
     drawn, _, fold = _sides(edges, volume)
     chosen = (drawn[0] | drawn[1]) & (fold | apart)
-    order, starts = group_by_class(jnp.where(chosen, 0, CULLED))
-    return order, starts[1]
+    return selected(chosen)
 
 
 def clip_edges(
@@ -191,7 +211,7 @@ def cut(
     number = first_piece + jnp.arange(PIECES_AT_ONCE)
     # As many segments end before or at each piece's number.
     ended = jnp.zeros(PIECES_AT_ONCE, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
-    segment = jnp.cumsum(ended.add(1, mode="drop"))
+    segment = prefix_sum(ended.add(1, mode="drop"))
     exists = segment < ends.shape[0]
     segment = stored(jnp.minimum(segment, ends.shape[0] - 1))
     k = number - (ends - segments.parts)[segment]
@@ -227,8 +247,7 @@ def no_pieces(segments: Segments) -> Pieces:
 
 def gathered(pieces: Pieces) -> Pieces:
     """Those that exist first."""
-    slot = jnp.where(pieces.exists, jnp.cumsum(pieces.exists) - 1, pieces.exists.size)
-    order = jnp.zeros_like(slot).at[slot].set(jnp.arange(slot.size), mode="drop")
-    exists = jnp.arange(slot.size) < jnp.sum(pieces.exists)
+    number = jnp.arange(pieces.exists.size, dtype=jnp.int32)
+    order, count = compacted(pieces.exists, number)
     segment, pixel, range_, _ = (column[..., order] for column in pieces)
-    return Pieces(segment, pixel, range_, exists)
+    return Pieces(segment, pixel, range_, number < count)

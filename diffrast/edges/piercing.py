@@ -19,12 +19,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import over_batches, prefix_sum, selected
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import TOLERANCE, Table, corners_of, edge_values
-from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
 
 PIXELS_AT_ONCE = 64
 _TESTED_AT_ONCE = 512
@@ -77,8 +77,7 @@ def choose_pixels(
     largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
     least = jnp.minimum(jnp.minimum(least[:-2], least[1:-1]), least[2:])
     least = jnp.minimum(jnp.minimum(least[:, :-2], least[:, 1:-1]), least[:, 2:])
-    order, starts = group_by_class(jnp.where(largest > least, 0, CULLED).reshape(-1))
-    return order, starts[1]
+    return selected((largest > least).reshape(-1))
 
 
 def keep_near_crossings(
@@ -107,8 +106,9 @@ def keep_near_crossings(
         differ = (body[one] >= 0) & (body[other] >= 0) & (body[one] != body[other])
         changes = jnp.any(differ & (changes | unknown[one] | unknown[other]), axis=0)
         keep = exists & changes
-        slot = jnp.where(keep, total + jnp.cumsum(keep) - 1, order.shape[0])
-        return kept.at[slot].set(number, mode="drop"), total + jnp.sum(keep)
+        ends = prefix_sum(keep.astype(jnp.int32))
+        slot = jnp.where(keep, total + ends - 1, order.shape[0])
+        return kept.at[slot].set(number, mode="drop"), total + ends[-1]
 
     return over_batches(order, count, _TESTED_AT_ONCE, add, (order, count & 0))
 

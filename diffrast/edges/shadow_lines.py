@@ -5,12 +5,12 @@ falls on that face: along a straight line on the screen. It is cut to one pixel 
 the outline, where the next line begins; then it parts areas as an edge of a mesh does.
 
 With h the weight of points, 1 for places and 0 for directions, (x, y, w, h) are coordinates of
-space for a perspective camera, which drops h. The plane of a face is (r, r'), r · (x, y, w) + r' h
+space for a perspective camera, which drops h. For a parallel projection h is the weight that tells
+depth (see `Depth`), and moves with the light. The plane of a face is (r, r'), r · (x, y, w) + r' h
 = 0, and that of the shadow (p, p'); they meet on the screen where (r' p − p' r) · (x, y, 1) = 0.
 Where the corners of the shadow plane move, what it says of a point M = α light + β start + γ end
-changes by −p · (α dlight + β dstart + γ dend); and where those of the face do, the point seen at a
-place of the screen moves along the line of sight. A parallel projection drops another coordinate:
-its shadows have no lines yet.
+changes by −p · (α dlight + β dstart + γ dend) − p' α dh of the light; and where those of the face
+do, the point seen at a place of the screen moves along the line of sight.
 """
 
 import itertools
@@ -21,12 +21,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import selected
 from diffrast._stored import stored
-from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row
-from diffrast.edges.pieces import positive_part
+from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import Columns, Table, barycentrics, cross_rows, edge_functions
-from diffrast.raster.fixed_point import CULLED, group_by_class
 
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
@@ -47,8 +46,10 @@ class Cast(NamedTuple):
     # 3 * face + corner: the edge of the face opposite to the corner, whose shadow passes between a
     # pixel and the one on its right, or below it; -1 if there is none.
     lit: Bool[Array, "lights height_with_border width_with_border"]
+    patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
     source: Float[Array, "lights 4"]  # clip position
-    weight: Float[Array, " lights"]  # 1 for places, 0 for directions
+    weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
+    parallel: Bool[Array, ""] | None = None  # whether the weight moves with the light
 
 
 class _Plane(NamedTuple):
@@ -83,8 +84,20 @@ class Shadow(NamedTuple):
     wrong_side: Bool[Array, " n"]  # the image has the centre on the other side of the line
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
-    vertices: Int[Array, "3 2 n"]  # start and end of the edge; the face's corners; the light
-    motion: Float[Array, "3 6 n"]  # area on the right with x, y and w of these
+    vertices: Int[Array, "4 2 n"]  # start and end of the edge; the face's corners; the light; and
+    # twice the row of its weight
+    motion: Float[Array, "4 6 n"]  # area on the right with x, y and w of these
+
+
+def with_lights(cast: Cast, depth: Depth) -> tuple[Cast, Float[Array, "rows 4"]]:
+    """Shadows as this projection has them, and what follows the vertices' positions.
+
+    First the lights, then their weights in the place of w, so that they may move.
+    """
+    weight = jnp.where(depth.parallel, depth.weight(cast.source), cast.weight)
+    rows = jnp.zeros_like(cast.source).at[:, 3].set(weight)
+    cast = cast._replace(weight=weight, parallel=depth.parallel)
+    return cast, jnp.concatenate([cast.source, rows])
 
 
 def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
@@ -94,8 +107,7 @@ def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
     below = below[:, :-2] | below[:, 1:-1]
     right = right[:, :, :-2] | right[:, :, 1:-1]
     below = below[:, :, :-2] | below[:, :, 1:-1] | below[:, :, 2:]
-    order, starts = group_by_class(jnp.where(right | below, 0, CULLED).reshape(-1))
-    return order, starts[1]
+    return selected((right | below).reshape(-1))
 
 
 def cross_shadows(
@@ -106,7 +118,6 @@ def cross_shadows(
     cast: Cast,
     faces: Int[Array, "F 3"],
     pixels: Table,
-    topology: Topology,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Outlines:
     """Find the lines at pixels (column, row); `column_of_light` is where `pixels` has the light."""
@@ -121,7 +132,7 @@ def cross_shadows(
     edge = stored(cast.edge[light, _DIRECTION[:, None], row, column])
     own = stored(face_image[pixel[1] + 1, pixel[0] + 1])
     next_to = stored(face_image[row, column])
-    patch = topology.patches[jnp.maximum(next_to, 0)] == topology.patches[jnp.maximum(own, 0)]
+    patch = cast.patches[jnp.maximum(next_to, 0)] == cast.patches[jnp.maximum(own, 0)]
     again = jnp.any(edge[:, None] == jnp.where(jnp.tri(12, k=-1)[..., None] > 0, edge, -2), axis=1)
     valid = exists & (edge >= 0) & (own >= 0) & patch & ~again
 
@@ -185,10 +196,14 @@ def shadow_of(
     outlines: Outlines,
     number: Array,
     light: Int[Array, " n"],
+    weight_of_light: Int[Array, " n"],
     pixel: Int[Array, "2 n"],
     faces: Int[Array, "F 3"],
 ) -> Shadow:
-    """The line with this number, 0 and up, in each pixel; `light` is its column in `pixels`."""
+    """The line with this number, 0 and up, in each pixel.
+
+    `light` and `weight_of_light` are the rows of positions that have them.
+    """
     rank = jnp.cumsum(outlines.exists, axis=0) - 1
     here = outlines.exists & (rank == number)
     row = stored(jnp.minimum(first_row(here), 11))
@@ -226,11 +241,14 @@ def shadow_of(
     per_plane = (high - low) * inverse
     turn = per_plane * shadow.offset / _nonzero(volume)
     motions = [-per_plane * ground.offset * share * shadow.normal for share in shares]
+    weight_motion = -per_plane * ground.offset * shares[2] * shadow.offset
     corner_motions = [turn * value * ground.normal for value in e]
     rows = [motions[:2], corner_motions[:2], [corner_motions[2], motions[2]]]
-    motion = jnp.stack([jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows])
+    motion = [jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows]
+    motion = jnp.stack([*motion, jnp.zeros_like(motion[0]).at[2].set(weight_motion)])
     corners = faces[outlines.face].T
     vertices = [one(outlines.vertices[0]), one(outlines.vertices[1]), *corners, light]
+    vertices = [*vertices, weight_of_light, weight_of_light]
 
     # Of the two neighbours between which it passes one is on its right.
     looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
@@ -247,7 +265,7 @@ def shadow_of(
         wrong_side=alone & ((lit_on_right == centre_on_right) != outlines.centre_is_lit),
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
-        vertices=jnp.stack(vertices).reshape(3, 2, -1),
+        vertices=jnp.stack(vertices).reshape(4, 2, -1),
         motion=jnp.where(used, motion, 0),
     )
 

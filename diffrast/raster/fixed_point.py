@@ -12,16 +12,11 @@ integer path, by size; all others (a vertex behind the eye, far off the screen, 
 or far plane) are *wide* and keep homogeneous coordinates.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
-
-from diffrast._stored import stored
-
-T = TypeVar("T")
+from jaxtyping import Float, Int
 
 GUARD_BITS = 22  # |fixed-point coordinate| <= 2**22, so that differences fit 24 bits
 # Pixel blocks (rows, columns) that hold a face of each block class whole.
@@ -183,22 +178,6 @@ def group_by_class(classes: Int[Array, " F"]) -> tuple[Int[Array, " F"], Int[Arr
     order = jnp.zeros(count, jnp.int32)
     order = order.at[slot].set(jnp.arange(count, dtype=jnp.int32), mode="drop", unique_indices=True)
     return order, jnp.concatenate([starts[:, 0], ends[-1:, -1]])
-
-
-def over_batches(
-    order: Int[Array, " n"],
-    count: Int[Array, ""],
-    at_once: int,
-    add: Callable[[Int[Array, " some"], Bool[Array, " some"], T], T],
-    start: T,
-) -> T:
-    """Fold `add(indices, exists, total)` over the first `count` of `order`, so many at a time."""
-
-    def step(n: Array, total: T) -> T:
-        slots = n * at_once + jnp.arange(at_once)
-        return add(stored(order[jnp.minimum(slots, order.shape[0] - 1)]), slots < count, total)
-
-    return lax.fori_loop(0, (count + at_once - 1) // at_once, step, start)
 
 
 def minimum3(corner_values: list[Array]) -> Array:

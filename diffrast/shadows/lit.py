@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import over_batches, selected
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
-from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
 from diffrast.shadows.maps import Pictures
 
 _AT_ONCE = 512
@@ -65,14 +65,14 @@ def lit(pictures: Pictures, geometry: Geometry, rays: Rays) -> Float[Array, " n"
     depth = key + slope_x * texel.x + slope_y * texel.y
     rounding = _ROUNDINGS * jnp.finfo(key.dtype).eps * rays.unit
     bright = rays.asked & (rays.key >= depth - error - rounding)
-    order, starts = group_by_class(jnp.where(rays.asked & jnp.isinf(error), 0, CULLED))
+    order, count = selected(rays.asked & jnp.isinf(error))
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
         some = stored(Rays(*(column[..., chosen] for column in rays)))
         place = jnp.where(exists, chosen, bright.size)
         return bright.at[place].set(~_blocked(pictures, geometry, some), mode="drop")
 
-    return over_batches(order, starts[1], _AT_ONCE, look_closer, bright).astype(key.dtype)
+    return over_batches(order, count, _AT_ONCE, look_closer, bright).astype(key.dtype)
 
 
 def _texel_of(pictures: Pictures, rays: Rays) -> _Texel:

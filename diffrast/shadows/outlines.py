@@ -16,13 +16,13 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import over_batches, selected
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
 from diffrast.edges.planes import edge_functions
 from diffrast.geometry import Geometry, Points, at_points
 from diffrast.light import Light, casts_shadow
-from diffrast.raster.fixed_point import CULLED, group_by_class, over_batches
 from diffrast.shadows.cast import Shadows, by_resolution
 from diffrast.shadows.lit import Rays, face_corners, faces_near
 from diffrast.shadows.maps import Pictures
@@ -96,7 +96,7 @@ def _between_pixels(
         return jnp.stack([jnp.pad(right, ((0, 0), (0, 1))), jnp.pad(below, ((0, 1), (0, 0)))])
 
     pairs = jax.vmap(differs)(lit)
-    order, starts = group_by_class(jnp.where(pairs, 0, CULLED).reshape(-1))
+    order, count = selected(pairs.reshape(-1))
     face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
     barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
 
@@ -110,8 +110,8 @@ def _between_pixels(
         place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
-    none = jnp.full(pairs.size, -1, jnp.int32) + (starts[1] & 0)
-    return over_batches(order, starts[1], _AT_ONCE, look, none).reshape(pairs.shape)
+    none = jnp.full(pairs.size, -1, jnp.int32) + (count & 0)
+    return over_batches(order, count, _AT_ONCE, look, none).reshape(pairs.shape)
 
 
 def _edge_between(

@@ -1,0 +1,92 @@
+"""Work lists: the indices of what is chosen, and loops over them in batches of fixed size.
+
+Nothing here has a capacity: lists are as long as what they choose from, and batches are processed
+until none is left. Most images have few chosen pixels, so blocks without any are passed over.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Int
+
+from diffrast._stored import stored
+
+T = TypeVar("T")
+
+_BLOCK = 16
+_BLOCKS_AT_ONCE = 64
+_ROW = 64
+
+
+def prefix_sum(counts: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Running totals, each with its own entry; counts are not negative, sums of 64 below 2^24.
+
+    Within rows by products with a triangular matrix, exact in float32: several times faster than a
+    cumulative sum, to compile and to run.
+    """
+    size = counts.shape[0]
+    rows = -(-size // _ROW)
+    table = jnp.pad(counts, (0, rows * _ROW - size)).reshape(rows, _ROW).astype(jnp.float32)
+    triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
+    within = jnp.matmul(table, triangle, precision=lax.Precision.HIGHEST).astype(jnp.int32)
+    totals = within[:, -1]
+    if rows <= 8 * _ROW:
+        earlier = jnp.arange(rows)[:, None] > jnp.arange(rows)
+        before = jnp.sum(jnp.where(earlier, totals, 0), axis=1, dtype=jnp.int32)
+    else:
+        before = jnp.cumsum(totals) - totals
+    return (within + before[:, None]).reshape(-1)[:size]
+
+
+def compacted(
+    chosen: Bool[Array, " n"], values: Int[Array, " n"]
+) -> tuple[Int[Array, " n"], Int[Array, ""]]:
+    """The chosen ones of values, in order, in front of zeros; and how many."""
+    ends = prefix_sum(chosen.astype(jnp.int32))
+    slot = jnp.where(chosen, ends - 1, chosen.size)
+    return jnp.zeros_like(values).at[slot].set(values, mode="drop"), ends[-1]
+
+
+def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, ""]]:
+    """Indices of what is true, ascending, and how many; the list is a little longer than the mask.
+
+    Blocks in which something is true are found first, and only these are looked through.
+    """
+    count = -(-mask.size // _BLOCK)
+    blocks = stored(
+        jnp.pad(mask, (0, count * _BLOCK - mask.size)).reshape(count, _BLOCK).astype(jnp.int8)
+    )
+    block_list, block_count = compacted(
+        jnp.max(blocks, axis=1) > 0, jnp.arange(count, dtype=jnp.int32)
+    )
+
+    def add(block: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        indices, total = state
+        chosen = (blocks[block] > 0) & exists[:, None]
+        number = block[:, None] * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)
+        more, added = compacted(chosen.reshape(-1), number.reshape(-1))
+        return lax.dynamic_update_slice(indices, more, (total,)), total + added
+
+    # The start is made from the data so that, under `shard_map`, it varies like them.
+    zero = block_count & 0
+    room = mask.size + _BLOCK * _BLOCKS_AT_ONCE
+    indices = jnp.zeros(room, jnp.int32) + zero
+    return over_batches(block_list, block_count, _BLOCKS_AT_ONCE, add, (indices, zero))
+
+
+def over_batches(
+    order: Int[Array, " n"],
+    count: Int[Array, ""],
+    at_once: int,
+    add: Callable[[Int[Array, " some"], Bool[Array, " some"], T], T],
+    start: T,
+) -> T:
+    """Fold `add(indices, exists, total)` over the first `count` of `order`, so many at a time."""
+
+    def step(n: Array, total: T) -> T:
+        slots = n * at_once + jnp.arange(at_once)
+        return add(stored(order[jnp.minimum(slots, order.shape[0] - 1)]), slots < count, total)
+
+    return lax.fori_loop(0, (count + at_once - 1) // at_once, step, start)
