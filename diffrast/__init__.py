@@ -44,6 +44,7 @@ from diffrast.raster import rasterize as rasterize
 from diffrast.render import Buffers as Buffers
 from diffrast.render import render as render
 from diffrast.render import render_buffers as render_buffers
+from diffrast.render import shadow_outlines as shadow_outlines
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
 from diffrast.settings import RenderSettings as RenderSettings

@@ -29,7 +29,7 @@ from diffrast.light import Columns, casts_shadow, normalize_columns
 from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
-from diffrast.shadows import Reached, terminators
+from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 
 
@@ -156,6 +156,39 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         uv=None if geometry.uvs is None else stacked(at_points(geometry.uvs, geometry, pixels)),
         lit=stacked(lit_parts) if lit_parts else None,
     )
+
+
+@jax.jit
+def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> Parted | None:
+    """Which edges have the outlines of the shadows in a picture, and how many are not known.
+
+    Where a shadow begins or ends between two pixels without a known edge, the picture is jagged
+    and its derivative leaves the outline out: `pairs - found` counts these, for each light.
+
+    Args:
+        scene: what is seen.
+        camera: from where.
+        settings: image size and method; `samples` is not used.
+
+    Returns:
+        For each light that casts shadows, in the scene's order, the edge between each pixel and the
+        one on its right (0) and below it (1), as 3 * face + the corner opposite to it, -1 where
+        there is none; the number of pairs of pixels of one surface that a shadow parts, and the
+        number of those with an edge. None without such lights or without objects.
+    """
+    if not scene.objects or not any(map(casts_shadow, scene.lights)):
+        return None
+    geometry = world_geometry(scene, settings.shading)
+    clip = clip_positions(geometry, camera)
+    size = settings.height, settings.width
+    pixels = visible_points(geometry, clip, *size, settings.cull_backfaces)
+    lighting = "flat" if settings.shading == "unlit" else settings.shading
+    world, reached = cast_shadows(scene, camera, geometry, pixels, lighting)
+    topology = scene_topology(scene)
+    cast = cast_outlines(world, topology, pixels, reached)
+    assert cast is not None
+    assert world.shadows is not None
+    return parted(world.shadows, topology, pixels, cast.lit, cast.edge)
 
 
 def _with_edges(

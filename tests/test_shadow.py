@@ -210,12 +210,45 @@ def test_a_light_that_is_not_seen_leaves_its_ambient_part():
     np.testing.assert_allclose(got, want, atol=2e-6)
 
 
-def test_the_picture_with_edges_has_the_same_shadows():
-    scene = dr.Scene(objects=[ball(1), floor()], lights=[sun(resolution=64)])
-    got = dr.render(scene, ROUND_THE_CORNER, settings(antialias=True))
-    want = dr.render(scene, ROUND_THE_CORNER, settings())
-    assert np.isfinite(got).all()
-    assert np.mean(np.any(np.abs(got - want) > 1e-5, axis=-1)) < 0.1
+def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
+    """Picture and derivative by the light against many samples."""
+    size, step = 48, 0.01
+    turned = linalg.compose(linalg.translation((0, -0.2, 0)), linalg.rotation_y(0.5))
+    box = dr.Object(shapes.cube(), transform=turned @ linalg.scaling(0.5))
+    tiles = floor(shapes.plane(8.0, 8.0, divisions=5))
+    camera = dr.Camera.orthographic(
+        eye=(3, 3, 6), target=(0, -0.3, 0), up=(0, 1, 0), height=4.0, near=0.1, far=50.0
+    )
+
+    def picture(direction, size, **options):
+        scene = dr.Scene(objects=[box, tiles], lights=[sun(direction)])
+        options = dr.RenderSettings(height=size, width=size, shading="flat", **options)
+        return dr.render(scene, camera, options)
+
+    def many_samples(direction):
+        fine = picture(direction, 16 * size, antialias=False)
+        return np.asarray(fine, float).reshape(size, 16, size, 16, 3).mean(axis=(1, 3))
+
+    light, way = jnp.array([-0.65, -1, -0.15]), jnp.array([0.6, 0.2, -0.7])
+    got, change = jax.jit(lambda d, v: jax.jvp(lambda d: picture(d, size), (d,), (v,)))(light, way)
+    want = many_samples(light)
+    assert np.mean(np.abs(got - want)) < 2.5e-4  # without edges .005
+    difference = (many_samples(light + step * way) - many_samples(light - step * way)) / (2 * step)
+    blurred = [
+        x.reshape(12, 4, 12, 4, 3).mean(axis=(1, 3)) for x in (np.asarray(change), difference)
+    ]
+    assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
+
+
+def test_pairs_of_pixels_without_an_outline_are_counted():
+    scene = dr.Scene(objects=[ball(2), floor()], lights=[sun(), sun((0.5, -1.0, 0.2))])
+    found = dr.shadow_outlines(scene, ROUND_THE_CORNER, settings())
+    assert found.edge.shape == (2, 2, SIZE, SIZE)
+    assert np.all(found.pairs > 30)
+    assert np.all(found.found <= found.pairs)
+    assert np.all(found.found >= 0.95 * found.pairs)
+    plain = replace(scene, lights=())
+    assert dr.shadow_outlines(plain, ROUND_THE_CORNER, settings()) is None
 
 
 def test_batches_equal_single_views():

@@ -129,7 +129,7 @@ def choose_edges(
     edges: Edges,
     volume: Float[Array, " F"],
     apart: Bool[Array, " E"],
-) -> tuple[Int[Array, " E"], Int[Array, ""]]:
+) -> tuple[Int[Array, " list"], Int[Array, ""]]:
     """Indices of the edges across which the picture may jump, in ascending order, and how many.
 
     Args:

@@ -12,4 +12,6 @@ from diffrast.shadows.cast import Shadows as Shadows
 from diffrast.shadows.cast import cast as cast
 from diffrast.shadows.cast import receive as receive
 from diffrast.shadows.cast import terminators as terminators
+from diffrast.shadows.outlines import Parted as Parted
 from diffrast.shadows.outlines import outlines as outlines
+from diffrast.shadows.outlines import parted as parted

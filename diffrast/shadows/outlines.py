@@ -32,6 +32,17 @@ _AT_ONCE = 256
 _STEPS = 64  # from face to face
 
 
+class Parted(NamedTuple):
+    """Neighbouring pixels that show one surface, lit at one of them only.
+
+    Left out are those whose dark one faces away from the light: there no shadow falls.
+    """
+
+    edge: Int[Array, "lights 2 height width"]  # result of `outlines`
+    pairs: Int[Array, " lights"]  # how many there are
+    found: Int[Array, " lights"]  # and between how many of them an outline passes that is known
+
+
 class _Lamps(NamedTuple):
     """The lights of some pictures."""
 
@@ -88,14 +99,7 @@ def _between_pixels(
     lit: Bool[Array, "lights height width"],
 ) -> Int[Array, "lights 2 height width"]:
     height, width = points.face.shape
-    patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
-
-    def differs(lit: Array) -> Array:
-        right = (lit[:, 1:] != lit[:, :-1]) & (patch[:, 1:] == patch[:, :-1])
-        below = (lit[1:] != lit[:-1]) & (patch[1:] == patch[:-1])
-        return jnp.stack([jnp.pad(right, ((0, 0), (0, 1))), jnp.pad(below, ((0, 1), (0, 0)))])
-
-    pairs = jax.vmap(differs)(lit)
+    pairs = _pairs(topology, points, lit)
     order, count = selected(pairs.reshape(-1))
     face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
     barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
@@ -112,6 +116,38 @@ def _between_pixels(
 
     none = jnp.full(pairs.size, -1, jnp.int32) + (count & 0)
     return over_batches(order, count, _AT_ONCE, look, none).reshape(pairs.shape)
+
+
+def _pairs(
+    topology: Topology, points: Points, lit: Bool[Array, "lights height width"]
+) -> Bool[Array, "lights 2 height width"]:
+    """Whether a pixel and that on its right, or below it, show one surface, one of them lit."""
+    patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
+    right = (lit[:, :, 1:] != lit[:, :, :-1]) & (patch[:, 1:] == patch[:, :-1])
+    below = (lit[:, 1:] != lit[:, :-1]) & (patch[1:] == patch[:-1])
+    right, below = (
+        jnp.pad(right, ((0, 0), (0, 0), (0, 1))),
+        jnp.pad(below, ((0, 0), (0, 1), (0, 0))),
+    )
+    return jnp.stack([right, below], axis=1)
+
+
+def parted(
+    shadows: Shadows,
+    topology: Topology,
+    points: Points,
+    lit: Bool[Array, "lights height width"],
+    edge: Int[Array, "lights 2 height width"],
+) -> Parted:
+    """Count the pairs between which `outlines` looked for edges, and those with one."""
+    visible = jnp.maximum(points.face, 0)
+    shadowed = ~lit & jnp.stack([turned[visible] for turned in shadows.turned])
+    right = shadowed | jnp.roll(shadowed, -1, axis=2)
+    below = shadowed | jnp.roll(shadowed, -1, axis=1)
+    pairs = _pairs(topology, points, lit) & jnp.stack([right, below], axis=1)
+    return Parted(
+        edge, jnp.sum(pairs, axis=(1, 2, 3)), jnp.sum(pairs & (edge >= 0), axis=(1, 2, 3))
+    )
 
 
 def _edge_between(
