@@ -19,6 +19,7 @@ from diffrast import fit as fit
 from diffrast import linalg as linalg
 from diffrast import mesh as mesh
 from diffrast import shapes as shapes
+from diffrast import views as views
 from diffrast.camera import Camera as Camera
 from diffrast.camera import clip_to_pixel as clip_to_pixel
 from diffrast.camera import stack_cameras as stack_cameras
@@ -48,3 +49,4 @@ from diffrast.render import shadow_outlines as shadow_outlines
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
 from diffrast.settings import RenderSettings as RenderSettings
+from diffrast.views import render_views as render_views

@@ -70,6 +70,7 @@ def cast_outlines(
         patches=topology.patches,
         source=source,
         weight=jnp.array(weight, source.dtype),
+        parallel=jnp.zeros((), bool),
     )
 
 

@@ -68,6 +68,7 @@ ORDER = [
     "diffrast.shadows",
     "diffrast.surface",
     "diffrast.render",
+    "diffrast.views",
     "diffrast._fit_result",
     "diffrast._least_squares",
     "diffrast._scale_space",

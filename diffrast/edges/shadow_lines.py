@@ -49,7 +49,7 @@ class Cast(NamedTuple):
     patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
     source: Float[Array, "lights 4"]  # clip position
     weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
-    parallel: Bool[Array, ""] | None = None  # whether the weight moves with the light
+    parallel: Bool[Array, ""]  # whether the weight moves with the light
 
 
 class _Plane(NamedTuple):
@@ -244,8 +244,9 @@ def shadow_of(
     weight_motion = -per_plane * ground.offset * shares[2] * shadow.offset
     corner_motions = [turn * value * ground.normal for value in e]
     rows = [motions[:2], corner_motions[:2], [corner_motions[2], motions[2]]]
-    motion = [jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows]
-    motion = jnp.stack([*motion, jnp.zeros_like(motion[0]).at[2].set(weight_motion)])
+    of_pairs = [jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows]
+    of_weight = jnp.zeros_like(of_pairs[0]).at[2].set(weight_motion)
+    motion = jnp.stack([*of_pairs, of_weight])
     corners = faces[outlines.face].T
     vertices = [one(outlines.vertices[0]), one(outlines.vertices[1]), *corners, light]
     vertices = [*vertices, weight_of_light, weight_of_light]

@@ -1,0 +1,373 @@
+"""Many views through one call: on all cores, on several devices, in bounded memory.
+
+A compiled loop draws a chunk of views one after another, and several such loops run side by side:
+one on each core of the CPU, or on each of the devices given. A view is drawn by the same code
+whatever its place among the others, so the result has the same bits for any size of chunks and any
+number of cores or devices; sums are taken in blocks of fixed size for the same reason. A view is
+not only a camera: any tree of arrays with a common leading axis may differ from view to view,
+lights, transforms, materials or meshes of equal size.
+
+Inside of `jax.jit`, `jax.grad` and other transformations, where numbers are not known, the views
+are mapped by `jax.lax.map`, and the derivative draws each view again instead of keeping what it
+needs of all of them.
+"""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import Mesh as DeviceMesh
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Float
+
+from diffrast._check import is_concrete, positive_int
+from diffrast.camera import Camera
+from diffrast.render import render
+from diffrast.scene import Scene
+from diffrast.settings import RenderSettings
+
+_BLOCK = 8  # views that are summed one after another
+_CHUNK = 4
+_CHUNK_BYTES = 1 << 26
+_AXIS = "views"
+
+ViewFunction = Callable[[Any, Any], Any]
+
+
+def render_views(
+    scene: Scene,
+    cameras: Camera,
+    settings: RenderSettings,
+    *,
+    chunk: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Float[Array, "views height width 3"]:
+    """Render one scene from many viewpoints; equals `render` of each.
+
+    Differentiable as `render` is. For scenes that differ from view to view, for pictures that are
+    used and forgotten one by one, and for sums of gradients see `map_views`, `stream_views` and
+    `sum_views`.
+
+    Args:
+        scene: what is seen.
+        cameras: cameras along a leading axis, as `stack_cameras` or `jax.vmap` make them.
+        settings: image size and method.
+        chunk: views that one call of the compiled program draws; bounds the memory besides that of
+            the result. By default a few.
+        devices: on which to draw; by default all cores, if the default device is the CPU, or else
+            that device.
+
+    Returns:
+        (views, height, width, 3) linear RGB.
+
+    Raises:
+        ValueError: for cameras that are no stack or of unequal sizes, a chunk below 1 and an empty
+            list of devices.
+    """
+    if jnp.ndim(cameras.view) != 3:
+        raise ValueError(
+            f"cameras: wanted a stack, with views of shape (views, 4, 4), got shape"
+            f" {jnp.shape(cameras.view)}"
+        )
+    return map_views(_image, cameras, (scene, settings), chunk=chunk, devices=devices)
+
+
+def _image(shared: tuple[Scene, RenderSettings], camera: Camera) -> Array:
+    scene, settings = shared
+    return render(scene, camera, settings)
+
+
+def map_views(
+    function: ViewFunction,
+    views: Any,
+    shared: Any = None,
+    *,
+    chunk: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Any:
+    """Apply a function to every view and stack what it returns.
+
+    Args:
+        function: `function(shared, view)` of arrays, as `jax.jit` takes it; pass the same object
+            again and it is compiled once.
+        views: a tree of arrays with a common leading axis.
+        shared: a tree of arrays that all views have in common.
+        chunk: as in `render_views`.
+        devices: as in `render_views`.
+
+    Returns:
+        The tree that `function` returns, with a leading axis of views.
+
+    Raises:
+        ValueError: as `render_views`.
+    """
+    count, chunk, devices = _checked(views, chunk, devices)
+    if not _known(views, shared):
+        return _mapped(function, views, shared, count, devices)
+    if count == 0:
+        one = jax.eval_shape(function, shared, _one_of(views))
+        return jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), one)
+    stream = stream_views(function, views, shared, chunk=chunk, devices=devices or None)
+    parts = [part for _, part in stream]
+    return jax.tree.map(lambda *rows: jnp.asarray(_joined(rows)), *parts)
+
+
+def stream_views(
+    function: ViewFunction,
+    views: Any,
+    shared: Any = None,
+    *,
+    chunk: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Iterator[tuple[range, Any]]:
+    """As `map_views`, a chunk at a time and in order: pairs (which views, their results).
+
+    Not more than a chunk for each core or device, and one, is kept in memory::
+
+        for which, images in dr.views.stream_views(image, cameras, scene, chunk=8):
+            for number, picture in zip(which, images):
+                dr.save_image(f"{number:04}.png", picture)
+
+    Raises:
+        ValueError: as `render_views`, and inside of JAX's transformations.
+    """
+    count, chunk, devices = _checked(views, chunk, devices)
+    if not _known(views, shared):
+        raise ValueError("views: wanted known numbers; inside of transformations use map_views")
+    if count == 0:
+        return
+    size = chunk or _usual_chunk(function, views, shared)
+    for first, part in _in_order(_some, function, views, shared, size, devices):
+        number = min(size * max(len(devices), 1), count - first)
+        yield range(first, first + number), jax.tree.map(lambda x, n=number: x[:n], part)
+
+
+def sum_views(
+    function: ViewFunction,
+    views: Any,
+    shared: Any = None,
+    *,
+    devices: Sequence[jax.Device] | None = None,
+) -> Any:
+    """Apply a function to every view and add up what it returns, one view after another.
+
+    The gradient of a loss over many views, in memory that does not depend on how many these are::
+
+        def loss(parameters, view): ...
+
+        value, gradient = dr.views.sum_views(jax.value_and_grad(loss), views, parameters)
+
+    Arguments and errors as `map_views`. Sums of whole numbers and logical values are not for this.
+    """
+    count, _, devices = _checked(views, None, devices)
+    if not _known(views, shared) or count == 0:
+        step = jax.checkpoint(function, prevent_cse=False)
+        one = jax.eval_shape(function, shared, _one_of(views))
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
+
+        def add(total: Any, view: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, total, step(shared, view)), None
+
+        return lax.scan(add, nothing, views)[0]
+    total = None
+    for _, part in _in_order(_block_sum, function, views, shared, _BLOCK, devices):
+        for row in range(jax.tree.leaves(part)[0].shape[0]):
+            block = jax.tree.map(lambda x, row=row: x[row], part)
+            total = block if total is None else jax.tree.map(np.add, total, block)
+    return jax.tree.map(jnp.asarray, total)
+
+
+# --------------------------------------------------------------------------------- what is checked
+
+
+def _checked(
+    views: Any, chunk: int | None, devices: Sequence[jax.Device] | None
+) -> tuple[int, int | None, tuple[jax.Device, ...]]:
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(views)]
+    if not shapes or any(not shape or shape[0] != shapes[0][0] for shape in shapes):
+        raise ValueError(f"views: wanted arrays with a common leading axis, got shapes {shapes}")
+    if chunk is not None:
+        chunk = positive_int("chunk", chunk)
+    if devices is not None and len(devices) == 0:
+        raise ValueError("devices: wanted at least one, got none")
+    return shapes[0][0], chunk, tuple(devices or ())
+
+
+def _known(*trees: Any) -> bool:
+    return all(is_concrete(leaf) for leaf in jax.tree.leaves(trees))
+
+
+def _one_of(views: Any) -> Any:
+    """The shape of one view."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x)[1:], jnp.result_type(x)), views)
+
+
+def _usual_chunk(function: ViewFunction, views: Any, shared: Any) -> int:
+    one = jax.eval_shape(function, shared, _one_of(views))
+    size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(one))
+    return int(np.clip(_CHUNK_BYTES // max(size, 1), 1, _CHUNK))
+
+
+# ------------------------------------------------------------------------- where numbers are traced
+
+
+def _mapped(
+    function: ViewFunction, views: Any, shared: Any, count: int, devices: tuple[jax.Device, ...]
+) -> Any:
+    """By `lax.map`, on several devices as many views on each, the last ones drawn again."""
+    once = jax.checkpoint(function, prevent_cse=False)
+
+    def local(shared: Any, part: Any) -> Any:
+        return lax.map(lambda view: once(shared, view), part)
+
+    if len(devices) < 2 or count == 0:
+        return local(shared, views)
+    rest = -count % len(devices)
+    padded = jax.tree.map(
+        lambda x: jnp.concatenate([x, jnp.broadcast_to(x[-1:], (rest, *x.shape[1:]))]), views
+    )
+    all_of = jax.shard_map(
+        local,
+        mesh=_mesh(devices),
+        in_specs=(PartitionSpec(), PartitionSpec(_AXIS)),
+        out_specs=PartitionSpec(_AXIS),
+    )
+    return jax.tree.map(lambda x: x[:count], all_of(shared, padded))
+
+
+def _mesh(devices: tuple[jax.Device, ...]) -> DeviceMesh:
+    return DeviceMesh(np.array(devices), (_AXIS,))
+
+
+# -------------------------------------------------------------------------- where numbers are known
+
+
+def _some(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
+    """Results of the first `number` of some views; zeros for the others."""
+    one = jax.eval_shape(function, shared, _one_of(views))
+    size = jax.tree.leaves(views)[0].shape[0]
+
+    def step(i: Array, results: Any) -> Any:
+        result = function(shared, jax.tree.map(lambda x: x[i], views))
+        return jax.tree.map(lambda row, x: row.at[i].set(x), results, result)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), one)
+    return lax.fori_loop(0, number, step, nothing)
+
+
+def _block_sum(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
+    """Sum of results of the first `number` of some views, with a leading axis of one."""
+    one = jax.eval_shape(function, shared, _one_of(views))
+
+    def step(i: Array, total: Any) -> Any:
+        result = function(shared, jax.tree.map(lambda x: x[i], views))
+        return jax.tree.map(lambda all_, x: all_ + x[None], total, result)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), one)
+    return lax.fori_loop(0, number, step, nothing)
+
+
+@lru_cache(maxsize=64)
+def _program(
+    work: Callable[..., Any],
+    function: ViewFunction,
+    structure: Any,
+    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...],
+    devices: tuple[jax.Device, ...],
+    number: np.dtype,
+) -> Callable[..., Any]:
+    """The compiled loop over a chunk of views; `number` is the kind of numbers in use."""
+    del number
+    split = PartitionSpec(_AXIS)
+
+    def on_each(shared: Any, views: Any, number: Array) -> Any:
+        size = jax.tree.leaves(views)[0].shape[0]
+        before = lax.axis_index(_AXIS) * size
+        return work(function, shared, views, jnp.clip(number - before, 0, size))
+
+    def alone(shared: Any, views: Any, number: Array) -> Any:
+        return work(function, shared, views, number)
+
+    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    shared, views = jax.tree.unflatten(structure, leaves)
+    count = jax.ShapeDtypeStruct((), np.int32)
+    if not devices:
+        return jax.jit(alone).lower(shared, views, count).compile()
+    mesh = _mesh(devices)
+    everywhere, sharded = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), split))
+    # Every device works for itself: what a function does with `shared`, its derivative too, stays
+    # on the device.
+    on_all = jax.shard_map(
+        on_each,
+        mesh=mesh,
+        in_specs=(PartitionSpec(), split, PartitionSpec()),
+        out_specs=split,
+        check_vma=False,
+    )
+    jitted = jax.jit(on_all, in_shardings=(everywhere, sharded, everywhere), out_shardings=sharded)
+    return jitted.lower(shared, views, count).compile()
+
+
+def _in_order(
+    work: Callable[..., Any],
+    function: ViewFunction,
+    views: Any,
+    shared: Any,
+    size: int,
+    devices: tuple[jax.Device, ...],
+) -> Iterator[tuple[int, Any]]:
+    """Pairs (first view, result of `work`) of chunks of `size` views, for each device one."""
+    views = jax.tree.map(np.asarray, views)
+    shared = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), shared)
+    count, step = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
+
+    def chunk(first: int) -> Any:
+        def rows(x: np.ndarray) -> np.ndarray:
+            part = x[first : first + step]
+            return np.concatenate([part, np.repeat(part[-1:], step - len(part), axis=0)])
+
+        return jax.tree.map(rows, views)
+
+    leaves, structure = jax.tree.flatten((shared, chunk(0)))
+    kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    program = _program(work, function, structure, kinds, devices, jnp.result_type(float))
+
+    def draw(first: int) -> Any:
+        result = program(shared, chunk(first), np.int32(min(step, count - first)))
+        return jax.tree.map(_on_host, jax.block_until_ready(result))
+
+    workers = 1 if devices else _cores()
+    waiting: deque[tuple[int, Future[Any]]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for first in range(0, count, step):
+            waiting.append((first, pool.submit(draw, first)))
+            if len(waiting) > workers:
+                number, result = waiting.popleft()
+                yield number, result.result()
+        for number, result in waiting:
+            yield number, result.result()
+
+
+def _on_host(x: Array) -> Any:
+    """As numpy has it, unless other processes hold a part of it."""
+    return np.asarray(x) if x.is_fully_addressable else x
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    if len(parts) == 1:
+        return parts[0]
+    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
+
+
+def _cores() -> int:
+    """Cores that this process may use, 1 where another device draws."""
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
