@@ -1,0 +1,147 @@
+"""Many views: those of single calls, to the bit, for any chunk and number of devices."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrast as dr
+from diffrast import shapes, views
+
+SETTINGS = dr.RenderSettings(height=12, width=16, antialias=False)
+MESH = shapes.icosphere(1)
+TURNS = np.linspace(0, 6, 5).astype(np.float32)
+
+
+def camera(turn):
+    eye = jnp.stack([3 * jnp.sin(turn), jnp.ones_like(turn), 3 * jnp.cos(turn)])
+    return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.9, near=0.1, far=10.0)
+
+
+def scene(direction=(-0.4, -0.5, -1.0)):
+    return dr.Scene(objects=[dr.Object(MESH)], lights=[dr.DirectionalLight(direction=direction)])
+
+
+CAMERAS = dr.stack_cameras([camera(turn) for turn in TURNS])
+DIRECTION = jnp.array([-0.4, -0.5, -1.0])
+
+
+@pytest.fixture(scope="module")
+def singles():
+    return np.stack([dr.render(scene(), camera(turn), SETTINGS) for turn in TURNS])
+
+
+@pytest.mark.parametrize("options", [{}, {"chunk": 3}])
+def test_views_are_those_of_single_calls(singles, options):
+    np.testing.assert_array_equal(dr.render_views(scene(), CAMERAS, SETTINGS, **options), singles)
+
+
+def test_they_come_in_order_a_chunk_at_a_time(singles):
+    seen = []
+    stream = views.stream_views(views._image, CAMERAS, (scene(), SETTINGS), chunk=4)
+    for which, images in stream:
+        assert len(which) == len(images) <= 4
+        np.testing.assert_array_equal(images, singles[which.start : which.stop])
+        seen += which
+    assert seen == list(range(5))
+
+
+def lit_from(objects, view):
+    direction, turn = view
+    lights = [dr.DirectionalLight(direction=direction)]
+    return dr.render(dr.Scene(objects=objects, lights=lights), camera(turn), SETTINGS)
+
+
+def test_anything_may_differ_from_view_to_view():
+    directions = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    objects = [dr.Object(MESH)]
+    got = views.map_views(lit_from, (directions, TURNS), objects)
+    for i in (0, 4):
+        np.testing.assert_array_equal(got[i], lit_from(objects, (directions[i], TURNS[i])))
+
+
+def wave(frequency, place):
+    return jnp.sin(frequency * place + jnp.arange(7.0))
+
+
+def test_sums_of_gradients():
+    function = jax.value_and_grad(lambda frequency, place: jnp.sum(wave(frequency, place)))
+    places = np.linspace(0, 1, 41, dtype=np.float32)
+    got = views.sum_views(function, places, 3.0)
+    traced = jax.jit(lambda frequency: views.sum_views(function, places, frequency))(3.0)
+    each = np.sum([function(3.0, place) for place in places], axis=0)
+    np.testing.assert_allclose(got, each, rtol=1e-5)
+    np.testing.assert_allclose(traced, each, rtol=1e-5)
+
+
+def test_gradient_through_the_views(singles):
+    @jax.jit
+    @jax.value_and_grad
+    def loss(direction):
+        return jnp.sum(dr.render_views(scene(direction), CAMERAS, SETTINGS) ** 2)
+
+    value, gradient = loss(DIRECTION)
+    np.testing.assert_allclose(value, np.sum(singles**2), rtol=1e-5)
+    step = 1e-2 * gradient / jnp.linalg.norm(gradient)
+    difference = (loss(DIRECTION + step)[0] - loss(DIRECTION - step)[0]) / 2
+    np.testing.assert_allclose(difference, gradient @ step, rtol=2e-2)
+
+
+MANY_DEVICES = """
+import jax, numpy as np
+jax.config.update("jax_num_cpu_devices", 4)
+import diffrast as dr
+import test_views as t
+from diffrast import views
+
+images, sums = [], []
+for devices in (None, jax.devices()[:3]):
+    images.append(dr.render_views(t.scene(), t.CAMERAS, t.SETTINGS, devices=devices))
+for devices in (None, jax.devices()[:1], jax.devices()[:2], jax.devices()):
+    many = np.linspace(0, 1, 41, dtype=np.float32)
+    sums.append(views.sum_views(t.wave, many, np.float32(3), devices=devices))
+for other in images[1:]:
+    np.testing.assert_array_equal(other, images[0])
+for other in sums[1:]:
+    np.testing.assert_array_equal(other, sums[0])
+"""
+
+
+def test_the_number_of_devices_changes_no_bit():
+    subprocess.run([sys.executable, "-c", MANY_DEVICES], check=True, cwd="tests")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dr.render_views(scene(), camera(0.0), SETTINGS), "cameras: wanted a stack"),
+        (
+            lambda: dr.render_views(scene(), CAMERAS, SETTINGS, chunk=0),
+            "chunk: wanted an integer of at least 1, got 0",
+        ),
+        (
+            lambda: dr.render_views(scene(), CAMERAS, SETTINGS, devices=[]),
+            "devices: wanted at least one, got none",
+        ),
+        (
+            lambda: views.map_views(lit_from, (TURNS, TURNS[:3])),
+            "views: wanted arrays with a common leading axis",
+        ),
+        (
+            lambda: jax.jit(lambda v: list(views.stream_views(wave, v, 1.0)))(TURNS),
+            "views: wanted known numbers",
+        ),
+    ],
+)
+def test_errors_name_the_argument(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_no_views_give_no_images():
+    none = jax.tree.map(lambda x: x[:0], CAMERAS)
+    assert dr.render_views(scene(), none, SETTINGS).shape == (0, 12, 16, 3)
