@@ -12,6 +12,7 @@ are mapped by `jax.lax.map`, and the derivative draws each view again instead of
 needs of all of them.
 """
 
+import operator
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -180,7 +181,7 @@ def sum_views(
     for _, part in _in_order(_block_sum, function, views, shared, _BLOCK, devices):
         for row in range(jax.tree.leaves(part)[0].shape[0]):
             block = jax.tree.map(lambda x, row=row: x[row], part)
-            total = block if total is None else jax.tree.map(np.add, total, block)
+            total = block if total is None else jax.tree.map(operator.add, total, block)
     return jax.tree.map(jnp.asarray, total)
 
 

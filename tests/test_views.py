@@ -1,5 +1,6 @@
 """Many views: those of single calls, to the bit, for any chunk and number of devices."""
 
+import socket
 import subprocess
 import sys
 
@@ -112,6 +113,31 @@ for other in sums[1:]:
 
 def test_the_number_of_devices_changes_no_bit():
     subprocess.run([sys.executable, "-c", MANY_DEVICES], check=True, cwd="tests")
+
+
+TWO_PROCESSES = """
+import sys
+import jax, numpy as np
+jax.config.update("jax_cpu_collectives_implementation", "gloo")
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]))
+import test_views as t
+from diffrast import views
+
+places = np.linspace(0, 1, 21, dtype=np.float32)
+for work in (views.map_views, views.sum_views):
+    got = work(t.wave, places, np.float32(3), devices=jax.devices())
+    want = np.asarray(work(t.wave, places, np.float32(3)))
+    for shard in got.addressable_shards:
+        np.testing.assert_array_equal(shard.data, want[shard.index])
+"""
+
+
+def test_the_number_of_processes_changes_no_bit():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    command = [sys.executable, "-c", TWO_PROCESSES, address]
+    both = [subprocess.Popen([*command, str(i)], cwd="tests") for i in range(2)]
+    assert [process.wait(timeout=120) for process in both] == [0, 0]
 
 
 @pytest.mark.usefixtures("unchecked")
