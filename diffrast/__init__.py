@@ -17,6 +17,7 @@ of one's own in the place of any other.
 from diffrast import color as color
 from diffrast import fit as fit
 from diffrast import linalg as linalg
+from diffrast import lines as lines
 from diffrast import mesh as mesh
 from diffrast import shapes as shapes
 from diffrast.camera import Camera as Camera
@@ -37,6 +38,11 @@ from diffrast.light import DirectionalLight as DirectionalLight
 from diffrast.light import PointLight as PointLight
 from diffrast.light import Shadow as Shadow
 from diffrast.light import SpotLight as SpotLight
+from diffrast.lines import LineFragments as LineFragments
+from diffrast.lines import draw_lines as draw_lines
+from diffrast.lines import draw_lines_with_depth as draw_lines_with_depth
+from diffrast.lines import rasterize_lines as rasterize_lines
+from diffrast.lines import wireframe as wireframe
 from diffrast.material import Material as Material
 from diffrast.mesh import Mesh as Mesh
 from diffrast.raster import Fragments as Fragments
