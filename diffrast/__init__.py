@@ -53,3 +53,4 @@ from diffrast.render import render_buffers as render_buffers
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
 from diffrast.settings import RenderSettings as RenderSettings
+from diffrast.shapes import LSystem as LSystem
