@@ -28,6 +28,7 @@ ORDER = [
     "diffrast.shapes.curved",
     "diffrast.shapes.bezier",
     "diffrast.shapes.teapot",
+    "diffrast.shapes.fractals",
     "diffrast.shapes.lsystem",
     "diffrast.shapes",
     "diffrast.files._mesh_text",
