@@ -29,6 +29,7 @@ from diffrast.edges import antialias as antialias
 from diffrast.files import load_bezier as load_bezier
 from diffrast.files import load_image as load_image
 from diffrast.files import load_mesh as load_mesh
+from diffrast.files import load_polygons as load_polygons
 from diffrast.files import save_animation as save_animation
 from diffrast.files import save_image as save_image
 from diffrast.files import save_mesh as save_mesh
@@ -52,5 +53,7 @@ from diffrast.render import render as render
 from diffrast.render import render_buffers as render_buffers
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
+from diffrast.scene_files import read_scene as read_scene
+from diffrast.scene_files import render_scene_file as render_scene_file
 from diffrast.settings import RenderSettings as RenderSettings
 from diffrast.shapes import LSystem as LSystem
