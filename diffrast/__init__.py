@@ -14,6 +14,7 @@ The way of the data::
 of one's own in the place of any other.
 """
 
+from diffrast import clip as clip
 from diffrast import color as color
 from diffrast import fit as fit
 from diffrast import linalg as linalg

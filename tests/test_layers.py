@@ -23,6 +23,7 @@ ORDER = [
     "diffrast.camera",
     "diffrast._topology",
     "diffrast.mesh",
+    "diffrast.clip",
     "diffrast.shapes._grid",
     "diffrast.shapes.solids",
     "diffrast.shapes.curved",
