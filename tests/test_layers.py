@@ -84,6 +84,8 @@ ORDER = [
     "diffrast._least_squares",
     "diffrast._scale_space",
     "diffrast.fit",
+    "diffrast._commands",
+    "diffrast.__main__",
     "diffrast",
 ]
 
