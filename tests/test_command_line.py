@@ -41,9 +41,6 @@ def test_wireframes_and_scene_files(tmp_path):
     scene = str(DATA / "scene1.dat")
     assert _commands.is_scene_file(scene)
     assert not _commands.is_scene_file(str(DATA / "house.dat"))
-    arguments = ["render", scene, "--out", str(out), "--operation", "phong", "--no-antialias"]
-    assert main(arguments) == 0
-    assert dr.load_image(out).shape == (150, 150, 3)
 
 
 def test_fit_finds_a_light(tmp_path):
