@@ -41,7 +41,7 @@ def shaded(
 
 
 def sun(
-    direction: Sequence[float] = (-0.5, 0.6, -0.7),
+    direction: Sequence[float] = (0.6, 0.5, -0.75),
     diffuse: Sequence[float] = (0.85, 0.85, 0.85),
     ambient: float = 0.15,
     specular: Sequence[float] = (0, 0, 0),
@@ -99,7 +99,9 @@ def frustum(size: int) -> Array:
         world = dr.mesh.transform(item.mesh, item.transform)
         parts.append(dr.Object(dr.clip.clip_mesh(world, camera), item.material))
     seen = shaded(parts, [sun()], size, **view)
-    return side_by_side([seen, shaded(parts, [sun()], size, eye=(10, -8, 9), target=(0, 0, 1))])
+    return side_by_side(
+        [seen, shaded(parts, [sun()], size, eye=(7.5, -5.5, 6.5), target=(0, 0, 0.8))]
+    )
 
 
 def fractals(size: int) -> Array:
@@ -134,7 +136,7 @@ def buckyball_fractal(size: int) -> Array:
 
 
 def sponge(size: int) -> Array:
-    view: dict[str, Any] = {"eye": (3.4, -3.0, 2.4), "target": (0, 0, 0), "fov_y": 0.65}
+    view: dict[str, Any] = {"eye": (3.4, -3.0, 2.4), "target": (0, 0, 0), "fov_y": 0.75}
     camera = dr.Camera.perspective(**view, up=(0, 0, 1), near=0.1, far=60)
     lattice = dr.shapes.menger_sponge(3, flat=False)
     edges = dl.mesh_edges(lattice)
@@ -191,7 +193,8 @@ def highlights(size: int) -> Array:
     for shininess in (2.0, 10.0, 50.0, 250.0):
         material = dr.Material(diffuse=WHITE, specular=WHITE, shininess=shininess)
         images.append(shaded([teapot(material)], [light], size // 2))
-    return side_by_side(images, 2)
+    # The source shows its numbers as they are, not encoded as sRGB.
+    return dr.color.srgb_to_linear(side_by_side(images, 2))
 
 
 def contributions(size: int) -> Array:
@@ -205,7 +208,7 @@ def contributions(size: int) -> Array:
 
 
 def shadows(size: int) -> Array:
-    cast = dr.Shadow(resolution=1024)
+    cast = dr.Shadow(resolution=800)
     return side_by_side(
         [shaded(solids(), [sun(shadow=s)], size, background=SKY) for s in (cast, None)], 1
     )
@@ -234,7 +237,7 @@ def own_normals(size: int) -> Array:
 
 def green_teapot(size: int) -> Array:
     material = dr.Material(diffuse=(0.1, 0.55, 0.2), specular=WHITE, shininess=40.0)
-    light = sun((-0.9, 0.3, -0.35), (0.9, 0.9, 0.9), 0.2, (0.7, 0.7, 0.7))
+    light = sun((-0.75, -0.55, -0.4), (0.9, 0.9, 0.9), 0.1, (0.7, 0.7, 0.7))
     return shaded([teapot(material)], [light], size, background=(0.05, 0.05, 0.08))
 
 
@@ -248,12 +251,13 @@ def clay_teapot(size: int) -> Array:
 
 def pierced_patches(size: int) -> Array:
     centred = hill() - [1.5, 3.0, 0.6]
-    turned = centred @ np.asarray(dr.linalg.rotation_y(1.9))[:3, :3].T
+    tilt = np.asarray(dr.linalg.rotation_x(0.35))[:3, :3]
+    turned = (centred * [1, 1, -1] + [0.5, 0.4, 0.7]) @ tilt.T
     objects = [
         dr.Object(dr.shapes.bezier_mesh(control[None], 24), dr.Material(diffuse=color))
         for control, color in ((centred, (0.2, 0.5, 0.85)), (turned, (0.9, 0.6, 0.15)))
     ]
-    view = {"eye": (6.5, -5.0, 6.5), "target": (0, 0, 0), "fov_y": 0.75}
+    view = {"eye": (7.5, -4.5, 3.5), "target": (0, 0, 0), "fov_y": 0.85}
     return shaded(objects, [sun(ambient=0.3)], size, **view)
 
 
