@@ -61,7 +61,7 @@ def test_behind_the_eye_and_on_the_planes():
     assert (corners[:, 3] > 0.49).all()
     whole = flat([[-1, -1], [1, -1], [1, 1]])
     same = clip_triangles(whole, [[0, 1, 2]])
-    assert int(same.count[0]) == 3
+    assert int(same.sizes[0]) == 3
     np.testing.assert_array_equal(same.corners[0, :3], whole)
 
 

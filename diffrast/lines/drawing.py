@@ -1,7 +1,9 @@
 """Line drawings: points, lines between them, colours (FEATURES L1-L3, L6)."""
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -116,9 +118,8 @@ def draw_lines(
     """
     points = _check.float_array("points", points, ("points", 2))
     lines, height, width = _checked_lines(lines, points.shape[0], height, width)
-    segments = segments_from_pixels(points, lines, height=height, width=width)
-    style = _Style(height, width, line_width, antialias)
-    return _painted(segments, None, colors, background, style)
+    style = _style(height, width, line_width, antialias)
+    return _drawn(points, lines, None, colors, background, style)
 
 
 def draw_lines_with_depth(
@@ -160,9 +161,8 @@ def draw_lines_with_depth(
     positions_clip = _check.float_array("positions_clip", positions_clip, ("points", 4))
     lines, height, width = _checked_lines(lines, positions_clip.shape[0], height, width)
     surface = _surface(positions_clip, faces, fragments, height, width)
-    segments = segments_from_clip(positions_clip, lines, height=height, width=width)
-    style = _Style(height, width, line_width, antialias)
-    return _painted(segments, surface, colors, background, style, with_depth=True)
+    style = _style(height, width, line_width, antialias)
+    return _drawn(positions_clip, lines, surface, colors, background, style)
 
 
 def rasterize_lines(
@@ -200,16 +200,23 @@ def rasterize_lines(
     if lines.shape[0] == 0:
         raise ValueError("lines: wanted at least one line, got none")
     surface = _surface(positions_clip, faces, fragments, height, width)
-    segments = segments_from_clip(positions_clip, lines, height=height, width=width)
-    line = nearest_lines(segments, surface, height=height, width=width)
-    return _evaluated(positions_clip, lines, segments, line)
+    points, lines, count = _filled_up(positions_clip, lines)
+    return _fragments(points, lines, count, surface, height=height, width=width)
 
 
-def _evaluated(
-    positions_clip: Array, lines: Array, segments: Segments, line: Array
+@partial(jax.jit, static_argnames=("height", "width"))
+def _fragments(
+    positions_clip: Array,
+    lines: Array,
+    count: Array,
+    surface: Surface | None,
+    *,
+    height: int,
+    width: int,
 ) -> LineFragments:
     """Where pixels look at their lines: where the line crosses the pixel's column or row."""
-    height, width = line.shape
+    segments = _segments(positions_clip, lines, count, height, width)
+    line = nearest_lines(segments, surface, height=height, width=width)
     covered, at = line >= 0, jnp.maximum(line, 0)
     change = jnp.abs(segments.end - segments.start)[at]
     steep = change[..., 1] > change[..., 0]
@@ -242,42 +249,79 @@ class _Style(NamedTuple):
     antialias: bool
 
 
-def _painted(
-    segments: Segments,
+def _style(height: int, width: int, line_width: float, antialias: bool) -> _Style:
+    if not 0 < line_width < np.inf:
+        raise ValueError(f"line_width: wanted a number between 0 and inf, got {line_width}")
+    return _Style(height, width, float(line_width), bool(antialias))
+
+
+def _drawn(
+    points: Array,
+    lines: Array,
     surface: Surface | None,
     colors: ArrayInput,
     background: ArrayInput,
     style: _Style,
-    *,
-    with_depth: bool = False,
 ) -> Array:
-    height, width, line_width, antialias = style
-    dtype, count = segments.start.dtype, segments.seen.shape[0]
+    count, dtype = lines.shape[0], points.dtype
     colors = _check.float_array("colors", colors).astype(dtype)
     if colors.shape not in ((3,), (count, 3)):
         raise ValueError(f"colors: wanted shape (3,) or ({count}, 3), got {colors.shape}")
     background = _check.float_array("background", background).astype(dtype)
-    if background.shape not in ((3,), (height, width, 3)):
+    size = (style.height, style.width)
+    if background.shape not in ((3,), (*size, 3)):
         raise ValueError(
-            f"background: wanted shape (3,) or ({height}, {width}, 3), got {background.shape}"
+            f"background: wanted shape (3,) or ({size[0]}, {size[1]}, 3), got {background.shape}"
         )
-    if not 0 < line_width < np.inf:
-        raise ValueError(f"line_width: wanted a number between 0 and inf, got {line_width}")
     if count == 0:
-        return jnp.broadcast_to(background, (height, width, 3))
+        return jnp.broadcast_to(background, (*size, 3))
+    points, lines, used = _filled_up(points, lines)
+    if colors.ndim == 2:
+        colors = jnp.pad(colors, ((0, lines.shape[0] - count), (0, 0)))
+    return _picture(points, lines, used, surface, colors, background, style=style)
+
+
+def _filled_up(points: Array, lines: Array) -> tuple[Array, Array, Array]:
+    """Points and lines up to the next power of two, and how many lines are used.
+
+    So drawings of nearly the same size share a compiled program.
+    """
+    sizes = [1 << max(4, (array.shape[0] - 1).bit_length()) for array in (points, lines)]
+    used = jnp.asarray(lines.shape[0], jnp.int32)
+    points = jnp.pad(points, ((0, sizes[0] - points.shape[0]), (0, 0)), mode="edge")
+    return points, jnp.pad(lines, ((0, sizes[1] - lines.shape[0]), (0, 0))), used
+
+
+def _segments(points: Array, lines: Array, used: Array, height: int, width: int) -> Segments:
+    make = segments_from_pixels if points.shape[1] == 2 else segments_from_clip
+    segments = make(points, lines, height=height, width=width)
+    return segments._replace(seen=segments.seen & (jnp.arange(lines.shape[0]) < used))
+
+
+@partial(jax.jit, static_argnames=("style",))
+def _picture(
+    points: Array,
+    lines: Array,
+    used: Array,
+    surface: Surface | None,
+    colors: Array,
+    background: Array,
+    *,
+    style: _Style,
+) -> Array:
+    height, width, line_width, antialias = style
+    segments = _segments(points, lines, used, height, width)
+    size = {"height": height, "width": width}
     if not antialias:
-        size = {"height": height, "width": width}
-        if with_depth:
-            line = nearest_lines(segments, surface, **size)
-        else:
+        if points.shape[1] == 2:
             line = last_lines(segments, **size)
+        else:
+            line = nearest_lines(segments, surface, **size)
         shown = colors if colors.ndim == 1 else colors[jnp.maximum(line, 0)]
         return jnp.where((line >= 0)[..., None], shown, background)
-    ones = jnp.ones((count, 1), dtype)
+    ones = jnp.ones((lines.shape[0], 1), points.dtype)
     values = ones if colors.ndim == 1 else jnp.concatenate([colors, ones], axis=1)
-    sums = add_lines(
-        segments, values, surface, height=height, width=width, line_width=float(line_width)
-    )
+    sums = add_lines(segments, values, surface, **size, line_width=line_width)
     share = sums[..., -1:]
     mixed = colors * share if colors.ndim == 1 else sums[..., :3]
     return background * (1 - jnp.minimum(share, 1)) + mixed / jnp.maximum(share, 1)

@@ -9,6 +9,7 @@ and no scale.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
@@ -32,6 +33,7 @@ class Surface(NamedTuple):
     slopes: tuple[Float[Array, " pixels"], Float[Array, " pixels"]]
 
 
+@jax.jit
 def surface_of(
     positions_clip: Float[Array, "points 4"],
     faces: Int[Array, "faces 3"],
