@@ -14,9 +14,11 @@ The way of the data::
 of one's own in the place of any other.
 """
 
+from diffrast import clip as clip
 from diffrast import color as color
 from diffrast import fit as fit
 from diffrast import linalg as linalg
+from diffrast import lines as lines
 from diffrast import mesh as mesh
 from diffrast import shapes as shapes
 from diffrast import views as views
@@ -29,6 +31,7 @@ from diffrast.edges import antialias as antialias
 from diffrast.files import load_bezier as load_bezier
 from diffrast.files import load_image as load_image
 from diffrast.files import load_mesh as load_mesh
+from diffrast.files import load_polygons as load_polygons
 from diffrast.files import save_animation as save_animation
 from diffrast.files import save_image as save_image
 from diffrast.files import save_mesh as save_mesh
@@ -38,6 +41,11 @@ from diffrast.light import DirectionalLight as DirectionalLight
 from diffrast.light import PointLight as PointLight
 from diffrast.light import Shadow as Shadow
 from diffrast.light import SpotLight as SpotLight
+from diffrast.lines import LineFragments as LineFragments
+from diffrast.lines import draw_lines as draw_lines
+from diffrast.lines import draw_lines_with_depth as draw_lines_with_depth
+from diffrast.lines import rasterize_lines as rasterize_lines
+from diffrast.lines import wireframe as wireframe
 from diffrast.material import Material as Material
 from diffrast.mesh import Mesh as Mesh
 from diffrast.raster import Fragments as Fragments
@@ -48,5 +56,8 @@ from diffrast.render import render_buffers as render_buffers
 from diffrast.render import shadow_outlines as shadow_outlines
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
+from diffrast.scene_files import read_scene as read_scene
+from diffrast.scene_files import render_scene_file as render_scene_file
 from diffrast.settings import RenderSettings as RenderSettings
+from diffrast.shapes import LSystem as LSystem
 from diffrast.views import render_views as render_views

@@ -68,6 +68,84 @@ def test_flat_solids_have_the_normals_of_their_faces(solid):
         assert len(dm.edge_adjacency(mesh.vertices, mesh.faces).edges) == 3 * len(mesh.faces) // 2
 
 
+def test_buckyball_has_equal_edges_pentagons_and_hexagons():
+    mesh = shapes.buckyball(flat=False)
+    vertices = np.asarray(mesh.vertices)
+    assert vertices.shape == (60, 3)
+    assert mesh.faces.shape == (12 * 3 + 20 * 4, 3)
+    assert dm.is_closed(mesh)
+    assert dm.euler_characteristic(mesh) == 2
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, rtol=1e-6)
+    normals = np.asarray(dm.face_normals(vertices, mesh.faces))
+    assert (np.einsum("fc,fc->f", normals, vertices[mesh.faces[:, 0]]) > 0.8).all()
+    edges, pairs, _ = dm.edge_adjacency(vertices, mesh.faces)
+    bent = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < 0.999
+    assert bent.sum() == 90
+    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)[bent]
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-5)
+    assert (np.bincount(edges[bent].reshape(-1)) == 3).all()
+    volume = (125 + 43 * np.sqrt(5)) / 4 * lengths[0] ** 3
+    np.testing.assert_allclose(dm.signed_volume(mesh), volume, rtol=1e-5)
+    assert shapes.buckyball().vertices.shape == (3 * 116, 3)
+
+
+# -------------------------------------------------------------------------------------- fractals
+
+
+@pytest.mark.parametrize(
+    ("solid", "corners", "scale"),
+    [
+        (shapes.cube, 8, 3),
+        (shapes.tetrahedron, 4, 2),
+        (shapes.octahedron, 6, 2),
+        (shapes.dodecahedron, 20, 2 + (1 + np.sqrt(5)) / 2),
+        (shapes.icosahedron, 12, 3),
+        (shapes.buckyball, 60, 1 + 3 * (1 + np.sqrt(5)) / 2),
+    ],
+)
+def test_fractals_have_a_copy_at_every_corner(solid, corners, scale):
+    one, joined = solid(), solid(flat=False)
+    steps = 2 if corners < 60 else 1
+    copies = corners**steps
+    mesh = shapes.fractal(joined, steps, scale)
+    assert shapes.fractal(one, 1, scale).faces.shape[0] == corners * one.faces.shape[0]
+    assert mesh.faces.shape[0] == copies * one.faces.shape[0]
+    volume = dm.signed_volume(one) * copies / scale ** (3 * steps)
+    np.testing.assert_allclose(dm.signed_volume(mesh), volume, rtol=1e-4)
+    # The j-th corner of the j-th copy is where the large solid, round their middle, has it.
+    last = np.arange(corners)
+    points = np.asarray(mesh.vertices).reshape(copies // corners, corners, corners, 3)
+    large = np.asarray(joined.vertices) / scale ** (steps - 1)
+    want = points.mean(axis=(1, 2))[:, None] + large
+    np.testing.assert_allclose(points[:, last, last], want, atol=1e-5)
+    assert shapes.fractal(one, 0, scale).faces.shape == one.faces.shape
+
+
+def test_fractals_are_differentiable_in_their_scale():
+    cube = shapes.cube(flat=False)
+    slope = jax.jacfwd(lambda scale: shapes.fractal(cube, 1, scale).vertices)(2.5)
+    # v_j (1 - 1/s) + v_k / s
+    corners = np.asarray(cube.vertices)
+    want = (corners[:, None] - corners[None]) / 2.5**2
+    np.testing.assert_allclose(slope, want.reshape(-1, 3), atol=1e-6)
+
+
+def test_menger_sponge_has_its_cubes_and_its_surface():
+    for level in range(4):
+        mesh = shapes.menger_sponge(level, flat=False)
+        assert mesh.faces.shape[0] == 4 * 20**level + 8 * 8**level
+        assert dm.is_closed(mesh)
+        np.testing.assert_allclose(dm.signed_volume(mesh), 8 * (20 / 27) ** level, rtol=1e-4)
+        vertices = np.asarray(mesh.vertices)
+        np.testing.assert_allclose([vertices.min(), vertices.max()], [-1, 1])
+    assert dm.euler_characteristic(shapes.menger_sponge(1, flat=False)) == 2 - 2 * 5
+    whole = shapes.menger_sponge(2, interior=True, flat=False)
+    assert whole.faces.shape[0] == 12 * 400
+    np.testing.assert_allclose(dm.signed_volume(whole), 8 * (20 / 27) ** 2, rtol=1e-4)
+    flat = shapes.menger_sponge(1)
+    np.testing.assert_allclose(smallest_angle_cosine(flat), 1, rtol=1e-6)
+
+
 # ---------------------------------------------------------------------------------------- curved
 
 
@@ -194,6 +272,9 @@ def test_sizes_and_heights_are_differentiable():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: shapes.menger_sponge(6), "level: wanted at most 16777216 faces"),
+        (lambda: shapes.fractal(shapes.cube(), 9), "iterations: wanted at most 16777216 faces"),
+        (lambda: shapes.fractal(shapes.cube(), 1, 1.0), "scale: wanted a number between 1"),
         (lambda: shapes.icosphere(-1), "subdivisions: wanted an integer of at least 0, got -1"),
         (lambda: shapes.icosphere(1, 0.0), "radius: wanted a number between 0 and inf, got 0"),
         (lambda: shapes.uv_sphere(segments=2), "segments: wanted an integer of at least 3"),

@@ -1,4 +1,4 @@
-"""Solids, curved surfaces, Bézier patches and the teapot."""
+"""Solids, curved surfaces, Bézier patches and the teapot; fractals and L-systems."""
 
 from diffrast.shapes.bezier import BezierPatches as BezierPatches
 from diffrast.shapes.bezier import PatchPoints as PatchPoints
@@ -12,6 +12,11 @@ from diffrast.shapes.curved import icosphere as icosphere
 from diffrast.shapes.curved import plane as plane
 from diffrast.shapes.curved import torus as torus
 from diffrast.shapes.curved import uv_sphere as uv_sphere
+from diffrast.shapes.fractals import fractal as fractal
+from diffrast.shapes.fractals import menger_sponge as menger_sponge
+from diffrast.shapes.lsystem import LineDrawing as LineDrawing
+from diffrast.shapes.lsystem import LSystem as LSystem
+from diffrast.shapes.solids import buckyball as buckyball
 from diffrast.shapes.solids import cube as cube
 from diffrast.shapes.solids import dodecahedron as dodecahedron
 from diffrast.shapes.solids import icosahedron as icosahedron

@@ -1,8 +1,8 @@
-"""The Platonic solids (FEATURES G1; Van Houdt 8), centred at the origin.
+"""The Platonic solids and the buckyball (FEATURES G1, G3; Van Houdt 8, 17), centred at the origin.
 
 Sizes are the source's where it has round numbers: cube and tetrahedron have corners at (±1, ±1,
-±1), the tetrahedron four of the cube's eight; octahedron, icosahedron and dodecahedron have their
-corners on the unit sphere.
+±1), the tetrahedron four of the cube's eight; octahedron, icosahedron, dodecahedron and buckyball
+have their corners on the unit sphere.
 
 Every solid comes in two forms with the same edges and silhouettes. By default each triangle has
 its own three corners with the face's normal, so that a solid looks faceted in every kind of
@@ -56,6 +56,38 @@ def dodecahedron(*, flat: bool = True) -> Mesh:
     return _solid(unit, np.concatenate(rings), flat)
 
 
+def buckyball(*, flat: bool = True) -> Mesh:
+    """Truncated icosahedron in the unit sphere: 12 pentagons, 20 hexagons, 116 triangles.
+
+    Its corners are the points that part each edge of an icosahedron in three (Van Houdt 17).
+    """
+    corners, triangles = icosahedron_arrays()
+    count = len(corners)
+    start, end = triangles, np.roll(triangles, -1, axis=1)
+    # The corner on edge (a, b) that is nearer to a has number a * count + b.
+    places = np.unique(start * count + end)
+    nearer, farther = places // count, places % count
+    points = (2 * corners[nearer] + corners[farther]) / 3
+    points = points / np.linalg.norm(points, axis=1, keepdims=True)
+    near_start, near_end = (
+        np.searchsorted(places, a * count + b) for a, b in ((start, end), (end, start))
+    )
+    hexagons = np.stack([near_start, near_end], axis=2).reshape(-1, 6)
+    # Round a corner a of the icosahedron, from the edge towards b to the next one that way.
+    following = np.zeros((count, count), int)
+    following[start, end] = np.roll(triangles, 1, axis=1)
+    rim = [triangles[np.argmax(triangles == a) // 3] for a in range(count)]
+    first = [np.roll(face, -int(np.argmax(face == a)))[1] for a, face in enumerate(rim)]
+    around = [np.array(first)]
+    for _ in range(4):
+        around.append(following[np.arange(count), around[-1]])
+    pentagons = np.searchsorted(
+        places, np.arange(count)[:, None] * count + np.stack(around, axis=1)
+    )
+    mesh = Mesh(vertices=points, faces=np.concatenate([_fans(pentagons), _fans(hexagons)]))
+    return flat_shaded(mesh) if flat else mesh
+
+
 def icosahedron_arrays() -> tuple[np.ndarray, np.ndarray]:
     """Corners (12, 3) on the unit sphere and faces (20, 3): pole, ring, ring, pole."""
     angle = np.arange(10) * np.pi / 5
@@ -76,7 +108,11 @@ def icosahedron_arrays() -> tuple[np.ndarray, np.ndarray]:
 
 def _solid(corners: np.ndarray, polygons: np.ndarray, flat: bool) -> Mesh:
     """Cut equal convex polygons into fans."""
-    sides = range(1, polygons.shape[1] - 1)
-    triangles = np.stack([polygons[:, [0, k, k + 1]] for k in sides], axis=1)
-    mesh = Mesh(vertices=corners, faces=triangles.reshape(-1, 3))
+    mesh = Mesh(vertices=corners, faces=_fans(polygons))
     return flat_shaded(mesh) if flat else mesh
+
+
+def _fans(polygons: np.ndarray) -> np.ndarray:
+    """Triangles (faces, 3) of convex polygons with equally many corners."""
+    sides = range(1, polygons.shape[1] - 1)
+    return np.stack([polygons[:, [0, k, k + 1]] for k in sides], axis=1).reshape(-1, 3)

@@ -1,0 +1,331 @@
+"""What the command line does; `diffrast.__main__` says it in words."""
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from diffrast import fit, linalg, shapes
+from diffrast.camera import Camera
+from diffrast.color import linear_to_srgb
+from diffrast.files import (
+    load_bezier,
+    load_image,
+    load_mesh,
+    load_polygons,
+    save_animation,
+    save_image,
+)
+from diffrast.light import DirectionalLight
+from diffrast.lines import draw_lines, fit_points, mesh_edges, wireframe
+from diffrast.material import Material
+from diffrast.mesh import Mesh, with_normals
+from diffrast.render import render
+from diffrast.scene import Object, Scene
+from diffrast.scene_files import render_scene_file
+from diffrast.settings import RenderSettings
+
+T = TypeVar("T")
+
+SHAPES: dict[str, Callable[[], Mesh]] = {
+    "teapot": shapes.teapot,
+    "cube": shapes.cube,
+    "tetrahedron": shapes.tetrahedron,
+    "octahedron": shapes.octahedron,
+    "icosahedron": shapes.icosahedron,
+    "dodecahedron": shapes.dodecahedron,
+    "buckyball": shapes.buckyball,
+    "sphere": lambda: shapes.icosphere(3),
+    "torus": shapes.torus,
+    "sponge": lambda: shapes.menger_sponge(2),
+}
+_FIT_STEPS = 60
+
+
+class Framing(NamedTuple):
+    """Where a mesh is seen from."""
+
+    eye: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+    near: float
+    far: float
+
+
+def render_command(options: argparse.Namespace) -> str:
+    """Draw a mesh, or a scene file."""
+    if is_scene_file(options.file):
+        if options.size is not None:
+            raise ValueError(
+                f"{options.file}: a scene file has a size of its own; leave out --size"
+            )
+        image = render_scene_file(
+            options.file, operation=options.operation, antialias=not options.no_antialias
+        )
+        return _written(options.out, image)
+    if options.operation is not None:
+        raise ValueError(f"{options.file}: --operation is for scene files, which this is none of")
+    mesh = load(options.file)
+    camera = _camera(options, _framing(options, mesh))
+    return _written(options.out, render(_scene(options, mesh), camera, _settings(options)))
+
+
+def orbit_command(options: argparse.Namespace) -> str:
+    """Turn once round a mesh."""
+    mesh = load(options.file)
+    framing = _framing(options, mesh)
+    scene, settings = _scene(options, mesh), _settings(options)
+    up = framing.up / np.linalg.norm(framing.up)
+    frames = []
+    for k in _with_progress(range(options.frames), options):
+        turn = np.asarray(linalg.rotation(up, 2 * np.pi * k / options.frames))[:3, :3]
+        eye = framing.target + turn @ (framing.eye - framing.target)
+        frames.append(render(scene, _camera(options, framing._replace(eye=eye)), settings))
+    save_animation(options.out, frames, frames_per_second=options.fps)
+    return f"{options.out}: {len(frames)} pictures"
+
+
+def wireframe_command(options: argparse.Namespace) -> str:
+    """Draw the edges of a mesh."""
+    if is_scene_file(options.file):
+        operation = "wireframe" if options.normals is None else "normals"
+        image = render_scene_file(
+            options.file, operation=operation, antialias=not options.no_antialias
+        )
+        return _written(options.out, image)
+    mesh = load(options.file)
+    size = options.size or 512
+    image = wireframe(
+        _scene(options, mesh),
+        _camera(options, _framing(options, mesh)),
+        height=size,
+        width=size,
+        hidden=options.hidden,
+        normal_length=options.normals,
+        edges=[mesh_edges(mesh, flat=options.all_edges)],
+        line_width=options.line_width,
+        antialias=not options.no_antialias,
+    )
+    return _written(options.out, image)
+
+
+def fit_command(options: argparse.Namespace) -> str:
+    """Find eye, target, light and colour from a picture of a known mesh."""
+    mesh, picture = load(options.file), load_image(options.image)[..., :3]
+    shrink = max(1, math.ceil(max(picture.shape[:2]) / options.resolution))
+    picture = picture[: picture.shape[0] // shrink * shrink, : picture.shape[1] // shrink * shrink]
+    target = fit.downsample(picture, shrink)
+    framing = _framing(options, mesh)
+    reach = float(np.linalg.norm(framing.eye - framing.target))
+    background, light_start = jnp.asarray(options.background), jnp.asarray(options.light)
+    settings = RenderSettings(
+        height=target.shape[0], width=target.shape[1], antialias=not options.no_antialias
+    )
+    if mesh.normals is None:
+        mesh = with_normals(mesh)
+
+    def picture_of(params: dict[str, Array], size: RenderSettings) -> Array:
+        camera = Camera.perspective(
+            eye=framing.eye + reach * params["eye"],
+            target=framing.target + reach * params["target"],
+            up=framing.up,
+            fov_y=math.radians(options.fov),
+            aspect=size.width / size.height,
+            near=framing.near,
+            far=framing.far,
+        )
+        light = DirectionalLight(
+            direction=fit.direction_update(light_start, params["light"]),
+            ambient=params["ambient"],
+            diffuse=params["diffuse"],
+            specular=(0.0, 0.0, 0.0),
+        )
+        thing = Object(mesh, Material(diffuse=(1.0, 1.0, 1.0)))
+        return render(Scene(objects=[thing], lights=[light], background=background), camera, size)
+
+    start = {
+        "eye": jnp.zeros(3),
+        "target": jnp.zeros(3),
+        "light": jnp.zeros(2),
+        "ambient": 0.2 * jnp.asarray(options.color),
+        "diffuse": 0.8 * jnp.asarray(options.color),
+    }
+    result = fit.least_squares(
+        lambda params, target: picture_of(params, settings) - target,
+        start,
+        args=(target,),
+        steps=_FIT_STEPS,
+        damping=0.1,
+        tolerance=1e-5,
+        progress=not options.quiet,
+    )
+    found = result.params
+    numbers = {
+        "eye": framing.eye + reach * np.asarray(found["eye"]),
+        "target": framing.target + reach * np.asarray(found["target"]),
+        "light_direction": fit.direction_update(light_start, found["light"]),
+        "ambient": found["ambient"],
+        "diffuse": found["diffuse"],
+    }
+    report: dict[str, Any] = {name: np.asarray(v).tolist() for name, v in numbers.items()}
+    report["rms"] = math.sqrt(2 * result.loss / target.size)
+    report["renders"] = result.renders
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "fit.json").write_text(json.dumps(report, indent=1) + "\n")
+    images = [target, picture_of(start, settings), picture_of(found, settings)]
+    encoded = [np.asarray(linear_to_srgb(jnp.clip(image, 0, 1))) for image in images]
+    save_image(options.out / "fit.png", np.concatenate(encoded, axis=1), srgb=False)
+    return (
+        f"{options.out / 'fit.json'}: difference {report['rms']:.4f} after {result.renders}"
+        f" pictures ({result.reason}); {options.out / 'fit.png'}: target, start, result"
+    )
+
+
+def gallery_command(options: argparse.Namespace) -> str:
+    """Draw every shape of the library, and some L-systems."""
+    size = options.size or 192
+    options.out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name in _with_progress([*SHAPES, *_systems()], options):
+        if name in SHAPES:
+            mesh = load(name)
+            camera = _camera(options, _framing(options, mesh))
+            settings = RenderSettings(height=size, width=size, samples=4, antialias=False)
+            image = render(_scene(options, mesh), camera, settings)
+        else:
+            system, rounds = _systems()[name]
+            drawing = system.draw(rounds)
+            points = fit_points(drawing.points, size=size)
+            image = draw_lines(
+                points.points, drawing.lines, height=points.height, width=points.width
+            )
+        save_image(options.out / f"{name}.png", image)
+        written.append(name)
+    return f"{options.out}: {', '.join(written)}"
+
+
+def _systems() -> dict[str, tuple[shapes.LSystem, int]]:
+    right = math.pi / 2
+    plant = {"X": "F-[[X]+X]+F[+FX]-X", "F": "FF"}
+    return {
+        "koch": (
+            shapes.LSystem(initiator="F", rules={"F": "F+F--F+F"}, angle=math.radians(85)),
+            7,
+        ),
+        "dragon": (
+            shapes.LSystem(initiator="F", rules={"F": "F+G", "G": "F-G"}, angle=right),
+            12,
+        ),
+        "plant": (
+            shapes.LSystem(
+                initiator="X", rules=plant, angle=math.pi / 8, start_angle=right, draw="F"
+            ),
+            5,
+        ),
+    }
+
+
+# The parts they share -----------------------------------------------------------------------------
+
+
+def is_scene_file(file: str) -> bool:
+    """Whether a file is a scene of the thesis, rather than one of its objects."""
+    path = Path(file)
+    if path.suffix.lower() != ".dat" or not path.is_file():
+        return False
+    first = path.read_text(encoding="latin-1").partition("\n")[0].split()[:3]
+    return not (len(first) == 3 and all(word.isdigit() for word in first))
+
+
+def load(file: str) -> Mesh:
+    """The mesh of a file, or the shape of a name."""
+    if file in SHAPES:
+        return SHAPES[file]()
+    path = Path(file)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{file}: there is no such file, and no such shape among {', '.join(SHAPES)}"
+        )
+    if path.suffix.lower() == ".bez":
+        return shapes.bezier_mesh(load_bezier(path).control_points)
+    if path.suffix.lower() == ".dat":
+        return load_polygons(path).mesh
+    mesh = load_mesh(path)
+    return mesh if mesh.normals is not None else with_normals(mesh)
+
+
+def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
+    """The view that was asked for; by default all of the mesh from the front right above."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    reach = float(np.linalg.norm(vertices - centre, axis=1).max())
+    target = centre if options.target is None else np.asarray(options.target, np.float64)
+    up = np.asarray(options.up, np.float64)
+    if options.eye is None:
+        # Along 1 of right, 1 of front and 0.7 of up, whichever way is up.
+        axis = int(np.argmax(np.abs(up)))
+        direction = np.roll(np.array([0.75, -1.0, 0.6]), axis - 2) * np.where(
+            np.arange(3) == axis, np.sign(up[axis]), 1
+        )
+        distance = 1.15 * reach / math.sin(math.radians(options.fov) / 2)
+        eye = target + distance * direction / np.linalg.norm(direction)
+    else:
+        eye = np.asarray(options.eye, np.float64)
+    distance = float(np.linalg.norm(eye - centre))
+    far = distance + 2 * reach
+    return Framing(eye, target, up, max(distance - 1.5 * reach, far * 1e-3), far)
+
+
+def _camera(options: argparse.Namespace, framing: Framing) -> Camera:
+    return Camera.perspective(
+        eye=framing.eye,
+        target=framing.target,
+        up=framing.up,
+        fov_y=math.radians(options.fov),
+        near=framing.near,
+        far=framing.far,
+    )
+
+
+def _scene(options: argparse.Namespace, mesh: Mesh) -> Scene:
+    light = DirectionalLight(
+        direction=options.light, ambient=(0.2,) * 3, diffuse=(0.8,) * 3, specular=(0.4,) * 3
+    )
+    material = Material(diffuse=options.color, specular=(0.3, 0.3, 0.3))
+    return Scene(objects=[Object(mesh, material)], lights=[light], background=options.background)
+
+
+def _settings(options: argparse.Namespace) -> RenderSettings:
+    size = options.size or 512
+    return RenderSettings(
+        height=size,
+        width=size,
+        shading=options.shading,
+        samples=options.samples,
+        antialias=not options.no_antialias,
+    )
+
+
+def _written(path: Path, image: Array) -> str:
+    save_image(path, image)
+    return f"{path}: {image.shape[1]} by {image.shape[0]} pixels"
+
+
+def _with_progress(items: Sequence[T], options: argparse.Namespace) -> Iterator[T]:
+    """The items, with a progress bar where tqdm is installed and it is wanted."""
+    if options.quiet:
+        yield from items
+        return
+    try:
+        from tqdm.auto import tqdm
+    except ImportError as error:
+        raise ImportError(
+            "progress needs tqdm: install diffrast[progress], or pass --quiet"
+        ) from error
+    yield from tqdm(items)

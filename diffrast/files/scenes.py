@@ -1,0 +1,259 @@
+"""The thesis's object and scene files, *.dat (FEATURES G7, G8; Kos 9, 12.2.8, 12.2.9)."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from diffrast._tokens import Tokens
+from diffrast.mesh import Mesh, from_polygons
+
+OPERATIONS = ("wireframe", "normals", "phong", "gouraud")
+PROJECTIONS = ("parallel", "perspective")
+
+
+class Polygons(NamedTuple):
+    """Polygons of any number of corners, each belonging to a surface of the object."""
+
+    points: Float[np.ndarray, "points 3"]
+    polygons: tuple[tuple[int, ...], ...]
+    surfaces: Int[np.ndarray, " polygons"]
+
+    @property
+    def mesh(self) -> Mesh:
+        """Triangles, smooth within each surface; see `diffrast.mesh.from_polygons`."""
+        return from_polygons(self.points, self.polygons, self.surfaces)
+
+
+class PlacedFile(NamedTuple):
+    """An object of a scene file: rotated about x, y and z in turn, then scaled, then moved."""
+
+    name: str
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneFile:
+    """What a scene file says.
+
+    Attributes:
+        projection: "parallel" or "perspective".
+        view_plane_distance: VPD. The thesis's program takes it for the back clipping plane.
+        projection_distance: of the centre of projection from VRP, along VPN.
+        view_reference_point: VRP.
+        view_plane_normal: VPN, towards the viewer.
+        view_up: VUP.
+        window: width and height, in the plane through VRP, centred there.
+        raster_height: rows of the picture.
+        operation: "wireframe", "normals" (of the vertices, too), "phong" or "gouraud".
+        light: vector towards the light.
+        output: name of the file for the result.
+        objects: files and where they are put.
+    """
+
+    projection: str
+    view_plane_distance: float
+    projection_distance: float
+    view_reference_point: tuple[float, float, float]
+    view_plane_normal: tuple[float, float, float]
+    view_up: tuple[float, float, float]
+    window: tuple[float, float]
+    raster_height: int
+    operation: str
+    light: tuple[float, float, float]
+    output: str
+    objects: tuple[PlacedFile, ...]
+
+
+# -------------------------------------------------------------------------------------- objects
+
+
+def load_polygons(path: str | Path) -> Polygons:
+    """Read an object: points, polygons and the surfaces that they belong to.
+
+    A line with the numbers of points, polygons and surfaces; for every point its number and three
+    coordinates; for every polygon its number, surface, number of corners and their points,
+    counter-clockwise from outside. Anything in braces is a comment. `.mesh` makes triangles of it.
+
+    Raises:
+        ValueError: with file and line, for anything that does not follow the format.
+        OSError: when the file cannot be opened.
+    """
+    # Comments may hold letters of any encoding; the numbers are ASCII.
+    tokens = Tokens(Path(path).read_text(encoding="latin-1"), str(path))
+    count = tokens.integer("the number of points", 1)
+    polygon_count = tokens.integer("the number of polygons", 1)
+    surface_count = tokens.integer("the number of surfaces", 1)
+    points = np.zeros((count, 3))
+    for number in range(count):
+        tokens.integer(f"point number {number}", number, number + 1)
+        points[number] = [tokens.number(f"{axis} of point {number}") for axis in "xyz"]
+    polygons, surfaces = [], np.zeros(polygon_count, np.int32)
+    for number in range(polygon_count):
+        tokens.integer(f"polygon number {number}", number, number + 1)
+        surfaces[number] = tokens.integer(f"the surface of polygon {number}", 0, surface_count)
+        corners = tokens.integer(f"the number of corners of polygon {number}", 1)
+        wanted = f"a point of polygon {number}"
+        polygons.append(tuple(tokens.integer(wanted, 0, count) for _ in range(corners)))
+    tokens.end()
+    return Polygons(points, tuple(polygons), surfaces)
+
+
+def save_polygons(path: str | Path, polygons: Polygons) -> None:
+    """Write an object; reading it gives the same numbers back."""
+    surfaces = np.asarray(polygons.surfaces)
+    lines = [f"{len(polygons.points)} {len(polygons.polygons)} {surfaces.max() + 1}"]
+    for number, point in enumerate(np.asarray(polygons.points)):
+        lines.append(
+            f"{number} " + " ".join(np.format_float_positional(x, trim="0") for x in point)
+        )
+    for number, (surface, ids) in enumerate(zip(surfaces, polygons.polygons, strict=True)):
+        lines.append(f"{number} {surface} {len(ids)} " + " ".join(map(str, ids)))
+    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+# --------------------------------------------------------------------------------------- scenes
+
+
+def load_scene_file(path: str | Path) -> SceneFile:
+    """Read a scene: viewing, operation, light, and the files of its objects.
+
+    One entry a line, in the order of `SceneFile`'s attributes; what follows the numbers on a line
+    is a comment. After the number of objects each has its scale, rotation, translation and file
+    name; the thesis's program reads the name first, and such files are read, too.
+
+    Raises:
+        ValueError: with file and line, for anything that does not follow the format.
+        OSError: when the file cannot be opened.
+    """
+    lines = _Lines(Path(path).read_text(encoding="latin-1"), str(path))
+    projection = PROJECTIONS[lines.choice("the type of projection", len(PROJECTIONS))]
+    view_plane_distance = lines.numbers("the view plane's distance (VPD)", 1)[0]
+    projection_distance = lines.numbers("the distance of the centre of projection (PRP)", 1)[0]
+    if not projection_distance > 0:
+        raise lines.error("a distance of the centre of projection above 0")
+    points = [
+        lines.three(f"the {name}")
+        for name in ("view reference point (VRP)", "view plane normal (VPN)", "view up (VUP)")
+    ]
+    window = lines.numbers("the window's width and height", 2)
+    if not min(window) > 0:
+        raise lines.error("a window's width and height above 0")
+    raster_height = lines.choice("the number of rows", 1 << 16)
+    if raster_height < 1:
+        raise lines.error("a number of rows of at least 1")
+    operation = OPERATIONS[lines.choice("the operation", len(OPERATIONS))]
+    light = lines.three("the vector to the light")
+    output = lines.word("the name of the file for the result")
+    count = lines.choice("the number of objects", 1 << 20)
+    objects = []
+    for number in range(count):
+        of = f"of object {number + 1} of {count}"
+        name = None if lines.begins_with_number() else lines.word(f"the file name {of}")
+        placing = [lines.three(f"the {what} {of}") for what in ("scale", "rotation", "translation")]
+        if name is None:
+            name = lines.word(f"the file name {of}")
+        objects.append(PlacedFile(name, *placing))
+    return SceneFile(
+        projection=projection,
+        view_plane_distance=view_plane_distance,
+        projection_distance=projection_distance,
+        view_reference_point=points[0],
+        view_plane_normal=points[1],
+        view_up=points[2],
+        window=(window[0], window[1]),
+        raster_height=raster_height,
+        operation=operation,
+        light=light,
+        output=output,
+        objects=tuple(objects),
+    )
+
+
+def save_scene_file(path: str | Path, scene: SceneFile) -> None:
+    """Write a scene; reading it gives the same numbers back."""
+
+    def row(*numbers: float, comment: str) -> str:
+        return " ".join(f"{number:.17g}" for number in numbers) + f" {{{comment}}}"
+
+    lines = [
+        row(PROJECTIONS.index(scene.projection), comment="projection: 0 parallel, 1 perspective"),
+        row(scene.view_plane_distance, comment="VPD"),
+        row(scene.projection_distance, comment="PRP, distance from VRP"),
+        row(*scene.view_reference_point, comment="VRP"),
+        row(*scene.view_plane_normal, comment="VPN"),
+        row(*scene.view_up, comment="VUP"),
+        row(*scene.window, comment="window, width and height"),
+        row(scene.raster_height, comment="rows"),
+        row(OPERATIONS.index(scene.operation), comment="operation: " + ", ".join(OPERATIONS)),
+        row(*scene.light, comment="vector to the light"),
+        scene.output,
+        row(len(scene.objects), comment="objects"),
+    ]
+    for item in scene.objects:
+        for name in ("scale", "rotation", "translation"):
+            lines.append(row(*getattr(item, name), comment=name))
+        lines.append(item.name)
+    Path(path).write_text("\n".join(lines) + "\n", encoding="latin-1")
+
+
+class _Lines:
+    """Reads lines one after another, each by the words that it begins with."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self._name = name
+        self._lines = [line.replace("{", " {").split() for line in text.rstrip().split("\n")]
+        self._next = 0
+
+    def begins_with_number(self) -> bool:
+        """Whether the next line does, or there is none."""
+        line = self._lines[self._next] if self._next < len(self._lines) else ["0"]
+        return not line or _number(line[0]) is not None
+
+    def numbers(self, wanted: str, count: int) -> Sequence[float]:
+        words = self._line(wanted)
+        numbers = [_number(word) for word in words[:count]]
+        found = [number for number in numbers if number is not None]
+        if len(found) < count:
+            raise self.error(f"{wanted}, {count} number{'s' if count > 1 else ''}")
+        return found
+
+    def three(self, wanted: str) -> tuple[float, float, float]:
+        x, y, z = self.numbers(wanted, 3)
+        return x, y, z
+
+    def choice(self, wanted: str, bound: int) -> int:
+        value = self.numbers(wanted, 1)[0]
+        if value != int(value) or not 0 <= value < bound:
+            raise self.error(f"{wanted}, an integer in [0, {bound})")
+        return int(value)
+
+    def word(self, wanted: str) -> str:
+        words = self._line(wanted)
+        if not words or words[0].startswith("{"):
+            raise self.error(wanted)
+        return words[0]
+
+    def _line(self, wanted: str) -> list[str]:
+        if self._next == len(self._lines):
+            raise ValueError(f"{self._name}:{self._next}: wanted {wanted}, got the end of the file")
+        self._next += 1
+        return self._lines[self._next - 1]
+
+    def error(self, wanted: str) -> ValueError:
+        """The error that the line just read is not what was wanted."""
+        line = " ".join(self._lines[self._next - 1])
+        return ValueError(f"{self._name}:{self._next}: wanted {wanted}, got {line!r}")
+
+
+def _number(word: str) -> float | None:
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    return value if abs(value) < float("inf") else None

@@ -1,0 +1,173 @@
+"""Wireframes: the edges of a scene's meshes, with hidden ones removed (FEATURES L6, L7)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from diffrast import _check
+from diffrast._check import ArrayInput
+from diffrast._topology import edge_adjacency, join_indices
+from diffrast.camera import Camera, world_to_clip
+from diffrast.linalg import normalize, transform_normals, transform_points
+from diffrast.lines.drawing import draw_lines_with_depth
+from diffrast.mesh import Mesh, vertex_normals
+from diffrast.raster import rasterize
+from diffrast.scene import Object, Scene
+
+_FLAT = 1e-5  # sine of the angle between the planes of two faces that count as one polygon
+
+
+class SpaceLines(NamedTuple):
+    """Lines in space."""
+
+    points: Float[Array, "points 3"]
+    lines: Int[Array, "lines 2"]
+
+
+def mesh_edges(mesh: Mesh, *, flat: bool = False) -> Int[np.ndarray, "edges 2"]:
+    """Vertex numbers of every edge of a mesh, once; found on the host.
+
+    Args:
+        mesh: of known vertices and faces. Faces meet where positions are equal.
+        flat: whether to count edges between two faces in one plane, which a polygon has none of.
+    """
+    if not (_check.is_concrete(mesh.vertices) and _check.is_concrete(mesh.faces)):
+        raise ValueError(
+            "mesh: wanted known vertices and faces, got traced arrays; find the edges outside jit"
+        )
+    positions, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    adjacency = edge_adjacency(positions, faces)
+    if flat:
+        return adjacency.edges
+    corners = positions[faces]
+    normals = np.asarray(
+        normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    )
+    one, other = (normals[np.maximum(adjacency.edge_faces[:, k], 0)] for k in range(2))
+    bent = np.linalg.norm(np.cross(one, other), axis=1) > _FLAT
+    bent |= (np.sum(one * other, axis=1) < 0) | (adjacency.edge_faces[:, 1] < 0)
+    return adjacency.edges[bent]
+
+
+def polygon_edges(polygons: Sequence[ArrayInput] | np.ndarray) -> Int[np.ndarray, "edges 2"]:
+    """Vertex numbers of every side of polygons, once, whichever way it is passed.
+
+    Args:
+        polygons: the vertex numbers of each polygon, of any number of corners.
+    """
+    corner, sizes = join_indices(polygons, np.iinfo(np.int32).max)
+    begins = np.repeat(np.cumsum(sizes) - sizes, sizes)
+    place = np.arange(len(corner)) - begins
+    following = corner[begins + (place + 1) % np.maximum(np.repeat(sizes, sizes), 1)]
+    sides = np.sort(np.stack([corner, following], axis=1), axis=1)
+    return np.unique(sides[sides[:, 0] != sides[:, 1]], axis=0).astype(np.int32)
+
+
+def normal_lines(vertices: ArrayInput, normals: ArrayInput, length: ArrayInput) -> SpaceLines:
+    """Lines that show normals: from each vertex, `length` long, along its normal (FEATURES L7).
+
+    Differentiable in everything.
+
+    Args:
+        vertices: (vertices, 3).
+        normals: (vertices, 3), unit vectors.
+        length: in the unit of the vertices.
+    """
+    vertices = _check.float_array("vertices", vertices, ("vertices", 3))
+    normals = _check.float_array("normals", normals, (vertices.shape[0], 3))
+    length = _check.float_array("length", length, ())
+    count = vertices.shape[0]
+    tips = vertices + length * normals
+    lines = np.stack([np.arange(count), np.arange(count) + count], axis=1).astype(np.int32)
+    return SpaceLines(jnp.concatenate([vertices, tips]), jnp.asarray(lines))
+
+
+def wireframe(
+    scene: Scene,
+    camera: Camera,
+    *,
+    height: int,
+    width: int,
+    hidden: bool = False,
+    cull_backfaces: bool = False,
+    edges: Sequence[ArrayInput] | None = None,
+    color: ArrayInput | None = None,
+    normal_length: float | None = None,
+    line_width: float = 1.0,
+    antialias: bool = True,
+) -> Float[Array, "height width 3"]:
+    """Draw the edges of a scene's meshes (FEATURES L6, L7; Van Houdt 7-10, Kos 3).
+
+    Edges have the diffuse colour of their object's material. Differentiable in vertices,
+    transforms, camera, colours and background where `antialias` is on; which parts are hidden has
+    no derivative.
+
+    Args:
+        scene: its objects and background; lights play no role.
+        camera: from where it is seen.
+        height: rows of the image.
+        width: columns of the image.
+        hidden: draw edges behind faces, too.
+        cull_backfaces: faces that turn away hide nothing.
+        edges: for each object the (edges, 2) vertex numbers to join; None takes all edges but those
+            between two faces in one plane (`mesh_edges`), which needs meshes of known vertices.
+        color: (3,) linear RGB of all lines, instead of the materials'.
+        normal_length: draw the vertices' normals, too, this long in world units.
+        line_width: of anti-aliased lines, in pixels.
+        antialias: see `draw_lines`.
+
+    Raises:
+        ValueError: for wrong shapes, and traced meshes without `edges`.
+    """
+    if edges is not None and len(edges) != len(scene.objects):
+        raise ValueError(
+            f"edges: wanted those of {len(scene.objects)} objects, got {len(edges)} entries"
+        )
+    points, lines, colors, faces = [], [], [], []
+    first = 0
+    for number, item in enumerate(scene.objects):
+        positions = transform_points(item.transform, item.mesh.vertices)
+        own = mesh_edges(item.mesh) if edges is None else edges[number]
+        parts = [
+            SpaceLines(
+                positions, _check.index_array("edges", own, ("edges", 2), bound=len(positions))
+            )
+        ]
+        faces.append(item.mesh.faces + first)
+        if normal_length is not None:
+            parts.append(normal_lines(positions, _world_normals(item), normal_length))
+        for part in parts:
+            points.append(part.points)
+            lines.append(part.lines + first)
+            colors.append(jnp.broadcast_to(item.material.diffuse, (part.lines.shape[0], 3)))
+            first += part.points.shape[0]
+    size = {"height": height, "width": width}
+    if not points:
+        height, width = (_check.positive_int(name, value) for name, value in size.items())
+        return jnp.broadcast_to(scene.background, (height, width, 3))
+    positions_clip = world_to_clip(camera, jnp.concatenate(points))
+    joined = jnp.concatenate(faces)
+    fragments = None
+    if not hidden:
+        fragments = rasterize(positions_clip, joined, **size, cull_backfaces=cull_backfaces)
+    return draw_lines_with_depth(
+        positions_clip,
+        jnp.concatenate(lines),
+        jnp.concatenate(colors) if color is None else color,
+        **size,
+        faces=None if hidden else joined,
+        fragments=fragments,
+        background=scene.background,
+        line_width=line_width,
+        antialias=antialias,
+    )
+
+
+def _world_normals(item: Object) -> Array:
+    mesh = item.mesh
+    normals = vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
+    return normalize(transform_normals(item.transform, normals))

@@ -1,0 +1,82 @@
+"""The command line, at tiny size."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffrast as dr
+from diffrast import _commands
+from diffrast.__main__ import main
+
+DATA = Path(__file__).parent / "data"
+SMALL = ["--size", "24", "--no-antialias"]
+
+
+def test_render_and_orbit_draw_a_mesh(tmp_path, capsys):
+    mesh = tmp_path / "cube.off"
+    dr.save_mesh(mesh, dr.shapes.cube())
+    out = tmp_path / "cube.png"
+    assert main(["render", str(mesh), "--out", str(out), *SMALL]) == 0
+    assert "24 by 24 pixels" in capsys.readouterr().out
+    picture = np.asarray(dr.load_image(out))
+    assert picture.shape == (24, 24, 3)
+    covered = picture.max(axis=-1) > 0
+    assert covered[12, 12]
+    assert 0.2 < covered.mean() < 0.7
+    assert not covered[[0, -1]].any()
+    assert not covered[:, [0, -1]].any()
+    out = tmp_path / "orbit.gif"
+    turn = ["orbit", str(mesh), "--out", str(out), "--frames", "3", "--quiet"]
+    assert main([*turn, *SMALL]) == 0
+    assert out.read_bytes()[:4] == b"GIF8"
+
+
+def test_wireframes_and_scene_files(tmp_path):
+    out = tmp_path / "wire.png"
+    arguments = ["cube", "--out", str(out), "--hidden", *SMALL]
+    assert main(["wireframe", *arguments, "--normals", "0.5"]) == 0
+    assert 0.05 < np.mean(np.asarray(dr.load_image(out)).max(axis=-1) > 0) < 0.6
+    scene = str(DATA / "scene1.dat")
+    assert _commands.is_scene_file(scene)
+    assert not _commands.is_scene_file(str(DATA / "house.dat"))
+
+
+def test_fit_finds_a_light(tmp_path):
+    out = tmp_path / "target.png"
+    view = ["--color", "0.6", "0.6", "0.6", "--no-antialias"]
+    drawn = ["render", "cube", "--out", str(out), "--light", "-0.6", "0.4", "-0.9"]
+    assert main([*drawn, "--size", "24", *view]) == 0
+    arguments = ["--out", str(tmp_path / "fit"), "--resolution", "24", "--quiet", *view]
+    assert main(["fit", str(out), "cube", *arguments]) == 0
+    report = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert dr.load_image(tmp_path / "fit" / "fit.png").shape == (24, 72, 3)
+    assert len(report["eye"]) == len(report["target"]) == len(report["light_direction"]) == 3
+    assert report["rms"] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "nothing.obj"], "nothing.obj: there is no such file, and no such shape among"),
+        (["render", str(DATA / "scene1-as-printed.dat")], "scene1-as-printed.dat:19: wanted"),
+        (["render", "cube", "--operation", "phong"], "--operation is for scene files"),
+        (["render", str(DATA / "scene1.dat"), "--size", "9"], "leave out --size"),
+        (["render", "cube", "--samples", "3", "--size", "9"], "samples: wanted a square number"),
+    ],
+)
+def test_mistakes_are_told(arguments, message, capsys):
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_options_out_of_range_are_refused(capsys):
+    for arguments in (
+        ["render"],
+        ["render", "cube", "--fov", "180"],
+        ["orbit", "cube", "--frames", "0"],
+    ):
+        with pytest.raises(SystemExit):
+            main(arguments)
+    assert "wanted an integer of at least 1, got 0" in capsys.readouterr().err
