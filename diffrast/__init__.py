@@ -32,7 +32,9 @@ from diffrast.files import save_animation as save_animation
 from diffrast.files import save_image as save_image
 from diffrast.files import save_mesh as save_mesh
 from diffrast.interpolate import interpolate as interpolate
+from diffrast.interpolate import screen_derivatives as screen_derivatives
 from diffrast.light import AmbientLight as AmbientLight
+from diffrast.light import Attenuation as Attenuation
 from diffrast.light import DirectionalLight as DirectionalLight
 from diffrast.light import PointLight as PointLight
 from diffrast.light import Shadow as Shadow
@@ -47,3 +49,10 @@ from diffrast.render import render_buffers as render_buffers
 from diffrast.scene import Object as Object
 from diffrast.scene import Scene as Scene
 from diffrast.settings import RenderSettings as RenderSettings
+from diffrast.texture import CubeMapping as CubeMapping
+from diffrast.texture import CubeTexture as CubeTexture
+from diffrast.texture import PlanarMapping as PlanarMapping
+from diffrast.texture import SphereMapping as SphereMapping
+from diffrast.texture import Texture as Texture
+from diffrast.texture import map_points as map_points
+from diffrast.texture import sample_texture as sample_texture
