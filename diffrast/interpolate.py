@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._check import ArrayInput, float_array, index_array, positive_int
-from diffrast._stored import assemble, stored
+from diffrast._stored import assemble
 from diffrast.raster import Fragments
 from diffrast.raster.fragments import corners_at
 
@@ -173,7 +173,7 @@ def slopes_at(
         barycentrics: of the point there.
         values: of the attributes there.
     """
-    rows = stored(slopes[jnp.maximum(face, 0)])
+    rows = slopes[jnp.maximum(face, 0)]
     count = len(values)
     limit = 1 / jnp.finfo(rows.dtype).eps ** 2
     w = sum(barycentrics[j] * rows[..., 2 * count + 2 + j] for j in range(3))

@@ -179,9 +179,8 @@ def _group_colors(group: _Group, paint: Paint, geometry: Geometry, points: Point
     at: Columns = stored(coordinates(kind.mapping, found))
     slopes = None
     if paint.slopes is not None:
-        slopes = stored(
-            _slopes(kind, found, slopes_at(paint.slopes, points.face, points.barycentrics, found))
-        )
+        by_pixel = slopes_at(paint.slopes, points.face, points.barycentrics, found)
+        slopes = _slopes(kind, found, by_pixel)
     layout = layout_of(group.textures)
     color = stored(sample(kind, layout, paint.rows, which, at, slopes))
     return [color[..., c] for c in range(3)]

@@ -54,7 +54,7 @@ class Texture:
         *,
         mapping: Mapping | None = None,
         wrap: str | tuple[str, str] = "repeat",
-        filter: str = "trilinear",
+        filter: str = "bilinear",
         anisotropy: int = 1,
     ) -> None:
         image = float_array("image", image, ("height", "width", "channels"))
@@ -103,7 +103,7 @@ class CubeTexture:
         images: ArrayInput,
         *,
         mapping: CubeMapping | None = None,
-        filter: str = "trilinear",
+        filter: str = "bilinear",
     ) -> None:
         images = float_array("images", images, (6, "size", "size", "channels"))
         if images.size == 0:
@@ -117,7 +117,7 @@ class CubeTexture:
 
     @staticmethod
     def from_cross(
-        cross: ArrayInput, *, mapping: CubeMapping | None = None, filter: str = "trilinear"
+        cross: ArrayInput, *, mapping: CubeMapping | None = None, filter: str = "bilinear"
     ) -> "CubeTexture":
         """Fold a cross of six images, 3 rows of 4, the way cube maps are often stored.
 

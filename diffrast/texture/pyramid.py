@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
+from diffrast._stored import stored
 from diffrast.texture.kinds import AnyTexture, CubeTexture, texels
 
 # Views of a cube's sides: along +x, -x, +y, -y, +z, -z; right and up in the image.
@@ -68,7 +69,7 @@ def pyramid(
     """The image and the levels above it, differentiable in it."""
     images = [image]
     for _ in range(levels - 1):
-        images.append(_halved(_halved(images[-1], -3), -2))
+        images.append(stored(_halved(_halved(images[-1], -3), -2)))
     return images
 
 
@@ -98,21 +99,21 @@ def _level_sizes(texture: AnyTexture) -> list[tuple[int, int]]:
 
 
 def _halved(image: Array, axis: int) -> Array:
+    """Half as many texels along an axis, -3 or -2."""
     count = image.shape[axis]
     half = count // 2
     if half == 0:
         return image
-    axis = axis % image.ndim
-    parts = [
-        image[(slice(None),) * axis + (slice(start, start + 2 * half, 2),)] for start in (0, 1)
-    ]
+
+    def every_second(start: int) -> Array:
+        return lax.slice_in_dim(image, start, start + 2 * half - 1, 2, axis)
+
+    first, second = every_second(0), every_second(1)
     if count % 2 == 0:
-        return (parts[0] + parts[1]) / 2
-    third = image[(slice(None),) * axis + (slice(2, None, 2),)]
-    place = np.arange(half).reshape(-1, *(1,) * (image.ndim - axis - 1))
-    shares = [np.asarray(s / count, image.dtype) for s in (half - place, place + 1)]
-    middle = np.asarray(half / count, image.dtype)
-    return shares[0] * parts[0] + middle * parts[1] + shares[1] * third
+        return (first + second) * 0.5
+    place = np.arange(half).reshape(-1, *(1,) * (-axis - 1))
+    shares = [np.asarray(s / count, image.dtype) for s in (half - place, half, place + 1)]
+    return shares[0] * first + shares[1] * second + shares[2] * every_second(2)
 
 
 def _border_texels(size: int) -> np.ndarray:

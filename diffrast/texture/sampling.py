@@ -15,6 +15,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._check import ArrayInput, float_array
+from diffrast._stored import stored
 from diffrast.light import Columns
 from diffrast.texture.kinds import AnyTexture, CubeTexture, Texture
 from diffrast.texture.pyramid import FORWARD, RIGHT, UP, Layout, layout_of, rows_of
@@ -100,9 +101,8 @@ def sample(
     last = _table(np.subtract(layout.levels, 1), which)
     count = kind.anisotropy if isinstance(kind, Texture) else 1
     if count == 1:
-        return _trilinear(
-            rows, layout, which, side, coordinates, wrap, _clamped(_log2_length(steps), last)
-        )
+        height = stored(_clamped(_log2_length(steps), last))
+        return _trilinear(rows, layout, which, side, coordinates, wrap, height)
     along, height = _ellipse(steps, count)
     offset = (jnp.arange(count) + 0.5) / count - 0.5
     offset = offset.reshape(-1, *(1,) * coordinates[0].ndim).astype(coordinates[0].dtype)
@@ -110,7 +110,8 @@ def sample(
         c + offset * jnp.where(along, pair[0], pair[1])
         for c, pair in zip(coordinates, slopes, strict=True)
     ]
-    colors = _trilinear(rows, layout, which, side, places, wrap, _clamped(height, last))
+    height = stored(_clamped(height, last))
+    colors = _trilinear(rows, layout, which, side, places, wrap, height)
     return jnp.mean(colors, axis=0)
 
 
