@@ -24,10 +24,13 @@ from diffrast.camera import clip_to_pixel as clip_to_pixel
 from diffrast.camera import stack_cameras as stack_cameras
 from diffrast.camera import viewpoint as viewpoint
 from diffrast.camera import world_to_clip as world_to_clip
+from diffrast.color import LookUpTable as LookUpTable
+from diffrast.color import look_up as look_up
 from diffrast.edges import antialias as antialias
 from diffrast.files import load_bezier as load_bezier
 from diffrast.files import load_image as load_image
 from diffrast.files import load_mesh as load_mesh
+from diffrast.files import load_objects as load_objects
 from diffrast.files import save_animation as save_animation
 from diffrast.files import save_image as save_image
 from diffrast.files import save_mesh as save_mesh
@@ -43,6 +46,9 @@ from diffrast.material import Material as Material
 from diffrast.mesh import Mesh as Mesh
 from diffrast.raster import Fragments as Fragments
 from diffrast.raster import rasterize as rasterize
+from diffrast.recolor import depths as depths
+from diffrast.recolor import light_cosines as light_cosines
+from diffrast.recolor import recolor as recolor
 from diffrast.render import Buffers as Buffers
 from diffrast.render import render as render
 from diffrast.render import render_buffers as render_buffers

@@ -59,12 +59,10 @@ class Material:
         set_field(self, "shininess", float_array("shininess", shininess, ()))
         if texture is not None:
             if not isinstance(texture, Texture | CubeTexture):
-                raise ValueError(
-                    f"texture: wanted a Texture, a CubeTexture or None, got {type(texture).__name__}"
-                )
+                kind = type(texture).__name__
+                raise ValueError(f"texture: wanted a Texture, a CubeTexture or None, got {kind}")
             if texels(texture).shape[-1] != 3:
-                raise ValueError(
-                    f"texture: wanted three channels, got shape {texels(texture).shape}"
-                )
+                shape = texels(texture).shape
+                raise ValueError(f"texture: wanted three channels, got shape {shape}")
         set_field(self, "texture", texture)
         set_field(self, "highlight", one_of("highlight", highlight, HIGHLIGHTS))

@@ -2,8 +2,8 @@
 
 colour = Σ ambient + Σ_lights factor (diffuse max(n·l, 0) + specular max(r·v, 0)^m), with r the
 mirror image of l in n and the highlight only where n·l > 0 (FEATURES S1, S4). Blinn's highlight is
-max(n·h, 0)^m, with h half-way between l and the viewer's direction v (Blinn 1977). Everything is kept
-as columns, one array a component, which XLA fuses into one pass where stacked vectors make it
+max(n·h, 0)^m, with h half-way between l and the viewer's direction v (Blinn 1977). Everything is
+kept as columns, one array a component, which XLA fuses into one pass where stacked vectors make it
 compute their parts again for every component.
 """
 

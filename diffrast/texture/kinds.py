@@ -61,9 +61,8 @@ class Texture:
         if image.size == 0:
             raise ValueError(f"image: wanted at least one texel, got shape {image.shape}")
         if mapping is not None and not isinstance(mapping, PlanarMapping | SphereMapping):
-            raise ValueError(
-                f"mapping: wanted PlanarMapping, SphereMapping or None, got {type(mapping).__name__}"
-            )
+            kind = type(mapping).__name__
+            raise ValueError(f"mapping: wanted PlanarMapping, SphereMapping or None, got {kind}")
         pair = (wrap, wrap) if isinstance(wrap, str) else wrap
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise ValueError(f"wrap: wanted one name or two, got {wrap!r}")

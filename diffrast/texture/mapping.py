@@ -218,9 +218,11 @@ def _length(a: Array, b: Array) -> Array:
 
 
 def _angle(opposite: Array, adjacent: Array) -> Array:
-    """Their arctangent; 0, with derivative 0, where both are zero."""
-    nowhere = (opposite == 0) & (adjacent == 0)
-    return jnp.arctan2(jnp.where(nowhere, 0, opposite), jnp.where(nowhere, 1, adjacent))
+    """Their arctangent, of either relative to the larger one; 0 where both are zero."""
+    size = jnp.maximum(*(jnp.abs(lax.stop_gradient(part)) for part in (opposite, adjacent)))
+    somewhere = size > 0
+    inverse = 1 / jnp.where(somewhere, size, 1)
+    return jnp.arctan2(opposite * inverse, jnp.where(somewhere, adjacent * inverse, 1))
 
 
 def _on_cube(point: Columns, normal: Columns) -> Columns:

@@ -3,12 +3,13 @@
 Texels are looked up in rows that hold every level of every image (see `pyramid`), so the cost at a
 point does not depend on how many textures there are. Coordinates are split into a part with few
 bits, whose product with an image's size is exact, and the rest: weights are as precise as the
-coordinates themselves.
+coordinates themselves, for images of up to 4096 texels a side in float32.
 """
 
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -64,9 +65,13 @@ def sample_texture(
         wanted = (*at.shape, 2)
         steps = float_array("derivatives", derivatives, wanted, finite=False)
         slopes = [[steps[..., i, j] for j in range(2)] for i in range(count)]
-    columns = [at[..., i] for i in range(count)]
+    return _sampled(texture, [at[..., i] for i in range(count)], slopes)
+
+
+@jax.jit
+def _sampled(texture: AnyTexture, coordinates: Columns, slopes: Slopes | None) -> Array:
     layout = layout_of([texture])
-    return sample(texture, layout, rows_of([texture]), None, columns, slopes)
+    return sample(texture, layout, rows_of([texture]), None, coordinates, slopes)
 
 
 def sample(
@@ -145,8 +150,9 @@ def _ellipse(steps: Slopes, count: int) -> tuple[Array, Array]:
     along = lengths[0] >= lengths[1]
     longer = jnp.maximum(*lengths)
     # The area over the longer side, both relative to it.
-    unit = jnp.exp2(-jnp.where(jnp.abs(longer) < jnp.inf, longer, 0))
-    (ax, bx), (ay, by) = ([part * unit for part in pair] for pair in steps)
+    known = jnp.abs(longer) < jnp.inf
+    unit = jnp.exp2(-jnp.where(known, longer, 0))
+    (ax, bx), (ay, by) = ([jnp.where(known, part, 0) * unit for part in pair] for pair in steps)
     area = jnp.abs(ax * by - ay * bx)
     thin = ~(area * count > 1)
     across = jnp.log2(jnp.where(thin, 1, area))
@@ -230,30 +236,38 @@ def _row(level: _Level, side: Array | None, y: Array, x: Array) -> Array:
     return level.first + (side * width + level.height - y) * width + x + 1
 
 
-def _folded(coordinate: Array, wrap: str) -> Array:
-    """The same place within the image, 0 to 1; 0 for what is not finite."""
-    coordinate = jnp.where(jnp.isfinite(coordinate), coordinate, 0)
+def _folded(coordinate: Array, wrap: str) -> tuple[Array, Array]:
+    """The same place within the image, 0 to 1, as a sum of two.
+
+    The first is a multiple of a power of two, so that no product with an image's size rounds it;
+    it has no derivative. Coordinates whose fraction is lost count as 0.
+    """
+    bits = (jnp.finfo(coordinate.dtype).nmant + 1) // 2
+    known = jnp.abs(coordinate) < 2.0 ** (2 * bits)
+    coordinate = jnp.where(known, coordinate, 0)
+    if wrap not in ("repeat", "mirror"):
+        coordinate = jnp.clip(coordinate, 0, 1)
+    place = lax.stop_gradient(coordinate)
+    high = jnp.round(place * 2.0**bits) / 2.0**bits
+    low = coordinate - high
     if wrap == "repeat":
-        return coordinate - jnp.floor(lax.stop_gradient(coordinate))
+        return high - jnp.floor(place), low
     if wrap == "mirror":
-        there = coordinate - 2 * jnp.floor(lax.stop_gradient(coordinate) / 2)
-        return jnp.where(there > 1, 2 - there, there)
-    return jnp.clip(coordinate, 0, 1)
+        high = high - 2 * jnp.floor(place / 2)
+        returns = high + lax.stop_gradient(low) > 1
+        return jnp.where(returns, 2 - high, high), jnp.where(returns, -low, low)
+    return high, low
 
 
-def _in_texels(coordinate: Array, size: Number) -> tuple[Array, Array]:
-    """Coordinate × size as a sum of two; the first has no rounding error, and no derivative."""
-    format_ = jnp.finfo(coordinate.dtype)
-    high = lax.reduce_precision(
-        lax.stop_gradient(coordinate), format_.nexp, (format_.nmant + 1) // 2 - 1
-    )
+def _in_texels(coordinate: Array, size: Number, wrap: str) -> tuple[Array, Array]:
+    high, low = _folded(coordinate, wrap)
     size = jnp.asarray(size, coordinate.dtype)
-    return high * size, (coordinate - high) * size
+    return high * size, low * size
 
 
 def _neighbors(coordinate: Array, size: Number, wrap: str) -> tuple[Array, Array, Array]:
     """The texels on both sides of a coordinate, and the share of the second."""
-    high, low = _in_texels(_folded(coordinate, wrap), size)
+    high, low = _in_texels(coordinate, size, wrap)
     high = high - 0.5
     first = jnp.floor(high + lax.stop_gradient(low))
     share = (high - first) + low
@@ -267,7 +281,7 @@ def _neighbors(coordinate: Array, size: Number, wrap: str) -> tuple[Array, Array
 
 
 def _texel(coordinate: Array, size: Number, wrap: str) -> Array:
-    high, low = _in_texels(lax.stop_gradient(_folded(coordinate, wrap)), size)
+    high, low = _in_texels(lax.stop_gradient(coordinate), size, wrap)
     return jnp.clip(jnp.floor(high + low).astype(jnp.int32), 0, size - 1)
 
 
