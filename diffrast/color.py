@@ -68,7 +68,7 @@ def rgb_to_hls(rgb: ArrayInput) -> Float[Array, "*size 3"]:
     high, low = jnp.maximum(jnp.maximum(r, g), b), jnp.minimum(jnp.minimum(r, g), b)
     span, lightness = high - low, (high + low) / 2
     grey = span == 0
-    full = jnp.where(lightness <= 0.5, 2 * lightness, 2 - 2 * lightness)
+    full = jnp.where(lightness <= 0.5, high + low, (1 - high) + (1 - low))
     known = ~grey & (full != 0)
     saturation = jnp.where(known, span, 0) / jnp.where(known, full, 1)
     parts = [jnp.where(grey, 0, part) for part in (g - b, b - r, r - g)]
