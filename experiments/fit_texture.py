@@ -11,9 +11,9 @@ The error is that of the texels, true colours against found ones: a texel counts
 ball, and as seen if some picture depends on it, which the derivative of the sum of all pictures
 tells.
 
-Expected: the mean absolute error falls from 0.20 to about 0.01 where the texture is seen, in a
-minute or two on two cores; at the poles, where a row of texels is smaller than a pixel, only
-averages of texels can be known, but they count for little.
+Expected: the mean absolute error falls from 0.24 to 0.004 where the texture is seen, in a minute or
+two on two cores; at the poles, where a row of texels is smaller than a pixel, only averages of
+texels can be known, but they count for little.
 
 Written to `--out`: `fit_texture.json` with loss and errors, and `fit_texture.png` with the texture
 (true, start, found, 4 times their difference), some of the views, and the errors by step.
