@@ -34,6 +34,7 @@ class _Group(NamedTuple):
     """Textures that are mapped and filtered in one way; static but for their texels."""
 
     textures: list[AnyTexture]  # one of each image
+    owners: list[int]  # the first object with each image, see `Scene.shared`
     image_of_object: list[int]  # which of them each object shows, -1 for none
 
 
@@ -63,7 +64,7 @@ def paint_scene(
     """
     paints = []
     with jax.named_scope("textures"):
-        for textures, image_of_object in _groups(scene):
+        for textures, _, image_of_object in _groups(scene):
             attributes, corners = _attributes(scene, geometry, textures[0], image_of_object)
             slopes = None
             if textures[0].filter == "trilinear":
@@ -127,13 +128,13 @@ def _groups(scene: Scene) -> list[_Group]:
         texture = item.material.texture
         if texture is None:
             continue
-        nothing = _Group([], [-1] * len(scene.objects))
+        nothing = _Group([], [], [-1] * len(scene.objects))
         group = groups.setdefault(_way(texture), nothing)
-        first = group.image_of_object[scene.shared[number]]
-        if first < 0:
-            first = len(group.textures)
+        owner = scene.shared[number]
+        if owner not in group.owners:
+            group.owners.append(owner)
             group.textures.append(texture)
-        group.image_of_object[number] = first
+        group.image_of_object[number] = group.owners.index(owner)
     return list(groups.values())
 
 
