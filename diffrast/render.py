@@ -171,7 +171,7 @@ def _with_edges(
     if world.shadows is not None:
         apart = apart | terminators(world.shadows, topology.edges)
     if world.paints:
-        apart = apart | seams(world.paints, topology.edges)
+        apart = apart | seams(world.scene, world.paints, topology.edges)
     view = View(
         positions_clip=positions_clip,
         faces=geometry.faces,

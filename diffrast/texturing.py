@@ -92,17 +92,22 @@ def texel_colors(
     return colors
 
 
-def seams(paints: Paints, edges: Edges) -> Bool[Array, " edges"]:
-    """Edges whose two faces have different texture coordinates there."""
+def seams(scene: Scene, paints: Paints, edges: Edges) -> Bool[Array, " edges"]:
+    """Edges whose two faces show different places of a texture there."""
     found = jnp.zeros_like(edges.seam)
-    for paint in paints:
+    for (textures, *_), paint in zip(_groups(scene), paints, strict=True):
+        kind = textures[0]
+        repeats = isinstance(kind, Texture) and [wrap == "repeat" for wrap in kind.wrap]
         for k in range(2):
             corner = edges.corners // 3 if k == 0 else edges.corners % 3
             one, other = (
                 paint.attributes[paint.corners[jnp.maximum(edges.faces[:, i], 0), corner[:, i]]]
                 for i in range(2)
             )
-            found = found | jnp.any(one != other, axis=1)
+            apart = one - other
+            if repeats and apart.shape[1] == 2:
+                apart = jnp.where(jnp.array(repeats), apart - jnp.round(apart), apart)
+            found = found | jnp.any(apart != 0, axis=1)
     return found & (edges.faces[:, 1] >= 0)
 
 
