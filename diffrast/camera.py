@@ -351,17 +351,33 @@ def pixel_rays(camera: Camera, *, height: int, width: int) -> Float[Array, "heig
     Raises:
         ValueError: for a camera with distortion, whose rays have no closed form.
     """
+    return normalize(pixel_directions(camera, height=height, width=width)[0])
+
+
+def pixel_directions(
+    camera: Camera, *, height: int, width: int, border: int = 0
+) -> tuple[Float[Array, "_ _ 3"], Float[Array, "2 3"]]:
+    """`pixel_rays` of any length, also of pixels beyond the image; and their derivatives.
+
+    The second are those by a step to the next column, and to the next row: the same everywhere.
+    """
     _check_single(camera)
     if camera.distortion is not None:
         raise ValueError("camera: wanted one without distortion")
-    matrix = _pivoted_matrix(camera)[0][:, :3]
-    x = 2 * (np.arange(positive_int("width", width)) + 0.5) / width - 1
-    y = 1 - 2 * (np.arange(positive_int("height", height)) + 0.5) / height
-    # The ray lies in the plane of its column and in the plane of its row.
-    columns = matrix[0] - x.astype(matrix.dtype)[:, None] * matrix[3]
-    rows = matrix[1] - y.astype(matrix.dtype)[:, None] * matrix[3]
-    rays = normalize(jnp.cross(columns[None], rows[:, None]))
-    return jnp.where(dot(rays, matrix[2])[..., None] < 0, -rays, rays)
+    height, width = positive_int("height", height), positive_int("width", width)
+    first, second, depth, last = _pivoted_matrix(camera)[0][:, :3]
+    # The ray lies in the plane of its column, first - x last, and in that of its row.
+    steps = jnp.stack(
+        [jnp.cross(second, last) * (2 / width), jnp.cross(first, last) * (2 / height)]
+    )
+    centre = jnp.cross(first, second)
+    columns, rows = (
+        (np.arange(-border, size + border) + 0.5 - size / 2).astype(centre.dtype)
+        for size in (width, height)
+    )
+    rays = centre + columns[:, None] * steps[0] + rows[:, None, None] * steps[1]
+    sign = jnp.where(dot(centre, depth) < 0, -1, 1)
+    return sign * rays, sign * steps
 
 
 # -------------------------------------------------------------------------------------- details

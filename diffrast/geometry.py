@@ -29,7 +29,8 @@ class Geometry(NamedTuple):
     faces: Int[Array, "F 3"]
     faces_outward: Int[Array, "F 3"]  # turned round where a transform mirrors
     normals: Float[Array, "V 3"] | None  # None for flat and unlit shading
-    uvs: Float[Array, "V 2"] | None
+    uvs: Float[Array, "T 2"] | None
+    uv_faces: Int[Array, "F 3"]  # which of the uvs the corners have
     object_of_face: Int[Array, " F"]
     object_of_vertex: Int[Array, " V"]
 
@@ -45,10 +46,11 @@ class Points(NamedTuple):
 def world_geometry(scene: Scene, shading: str) -> Geometry:
     """All objects in the world, with what this shading needs of them."""
     with jax.named_scope("geometry"):
-        positions, faces, faces_outward, normals, uvs = [], [], [], [], []
+        positions, faces, faces_outward, normals, uvs, uv_faces = [], [], [], [], [], []
         smooth = shading in ("phong", "gouraud")
         textured = any(item.mesh.uvs is not None for item in scene.objects)
-        first_vertex = 0
+        own_uvs = any(item.mesh.uv_faces is not None for item in scene.objects)
+        first_vertex = first_uv = 0
         for item in scene.objects:
             mesh = item.mesh
             positions.append(transform_points(item.transform, mesh.vertices))
@@ -65,6 +67,10 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
                 own = mesh.uvs
                 none = jnp.zeros_like(mesh.vertices[:, :2])
                 uvs.append(none if own is None else own)
+            if own_uvs:
+                corners = mesh.faces if mesh.uv_faces is None else mesh.uv_faces
+                uv_faces.append(corners + first_uv)
+                first_uv += uvs[-1].shape[0]
         all_faces = jnp.concatenate(faces)
 
         def joined(parts: list[Array]) -> Array:
@@ -77,6 +83,7 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
             jnp.concatenate(faces_outward),
             joined(normals) if smooth else None,
             joined(uvs) if textured else None,
+            jnp.concatenate(uv_faces) if own_uvs else all_faces,
             jnp.asarray(np.repeat(counts, [o.mesh.faces.shape[0] for o in scene.objects])),
             jnp.asarray(np.repeat(counts, [o.mesh.vertices.shape[0] for o in scene.objects])),
         )
@@ -108,6 +115,13 @@ def at_points(attribute: Array, geometry: Geometry, points: Points) -> Columns:
     """Values at the vertices, (V, C), interpolated at points."""
     columns = [attribute[:, i] for i in range(attribute.shape[1])]
     return interpolate_columns(columns, geometry.faces, points.face, points.barycentrics)
+
+
+def uvs_at(geometry: Geometry, points: Points) -> Columns:
+    """Texture coordinates at points."""
+    assert geometry.uvs is not None
+    columns = [geometry.uvs[:, i] for i in range(2)]
+    return interpolate_columns(columns, geometry.uv_faces, points.face, points.barycentrics)
 
 
 def flat_normals(geometry: Geometry, face: Array) -> Columns:

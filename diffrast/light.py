@@ -13,11 +13,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, positive_int, real_number
+from diffrast._check import ArrayInput, float_array, one_of, positive_int, real_number
 from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.linalg import normalize
 
 Columns: TypeAlias = list[Array]  # x, y, z (or r, g, b), each of any one shape
+
+LEGS = ("light", "both", "viewer")
 
 
 @pytree_dataclass
@@ -54,6 +56,30 @@ class Shadow:
 
 
 @pytree_dataclass
+class Attenuation:
+    """Diffuse and specular light is divided by a + b r + c r² (FEATURES S3; Kos 6.1).
+
+    So (k, 1, 0) is the source's linear 1 / (r + k), and (0, 0, 1) the inverse square.
+
+    Attributes:
+        coefficients: (3,) a, b, c; differentiable.
+        legs: what r is, static: the way from the "light" to the point, that from the point to the
+            "viewer", or "both" one after the other, the source's R = r + D. The viewer is where
+            the eye system has its origin, also under parallel projection.
+
+    Raises:
+        ValueError: for wrong shapes, numbers that are not finite, and other legs.
+    """
+
+    coefficients: Float[Array, "3"]
+    legs: str = static()
+
+    def __init__(self, coefficients: ArrayInput, *, legs: str = "light") -> None:
+        set_field(self, "coefficients", float_array("coefficients", coefficients, (3,)))
+        set_field(self, "legs", one_of("legs", legs, LEGS))
+
+
+@pytree_dataclass
 class DirectionalLight:
     """Light from infinitely far away.
 
@@ -63,9 +89,11 @@ class DirectionalLight:
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None.
         shadow: how it casts shadows, or None for none.
+        attenuation: an `Attenuation` with the distance from the viewer, or None.
 
     Raises:
-        ValueError: for wrong shapes and numbers that are not finite.
+        ValueError: for wrong shapes and numbers that are not finite, and an attenuation with a
+            distance from the light.
     """
 
     direction: Float[Array, "3"]
@@ -73,6 +101,7 @@ class DirectionalLight:
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
     shadow: Shadow | None
+    attenuation: Attenuation | None
 
     def __init__(
         self,
@@ -82,10 +111,18 @@ class DirectionalLight:
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
         shadow: Shadow | None = None,
+        attenuation: Attenuation | None = None,
     ) -> None:
         set_field(self, "direction", float_array("direction", direction, (3,)))
         _set_colors(self, ambient, diffuse, specular)
         _set_shadow(self, shadow)
+        if attenuation is not None:
+            legs = attenuation.legs if isinstance(attenuation, Attenuation) else "light"
+            if legs != "viewer":
+                raise ValueError(
+                    f'attenuation: wanted an Attenuation of legs "viewer", got {legs!r}'
+                )
+        set_field(self, "attenuation", attenuation)
 
 
 @pytree_dataclass
@@ -98,19 +135,24 @@ class PointLight:
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None.
         attenuation: (3,) a, b, c: diffuse and specular light is divided by a + b r + c r² at the
-            distance r; None for no attenuation.
+            distance r; or an `Attenuation`; None for no attenuation.
         shadow: how it casts shadows, or None for none.
+        incidence_cutoff: None, or an angle in radians, 0 < a_s <= pi / 2: light that arrives at
+            the angle a from the normal is reflected diffusely as 1 - (1 - cos a) / (1 - cos a_s)
+            instead of cos a, and beyond a_s not at all (the spot of FEATURES S2; Van Houdt A20);
+            differentiable.
 
     Raises:
-        ValueError: for wrong shapes and numbers that are not finite.
+        ValueError: for wrong shapes, numbers that are not finite, and a cutoff out of range.
     """
 
     position: Float[Array, "3"]
     diffuse: Float[Array, "3"]
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
-    attenuation: Float[Array, "3"] | None
+    attenuation: Float[Array, "3"] | Attenuation | None
     shadow: Shadow | None
+    incidence_cutoff: Float[Array, ""] | None
 
     def __init__(
         self,
@@ -119,13 +161,20 @@ class PointLight:
         ambient: ArrayInput | None = None,
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
-        attenuation: ArrayInput | None = None,
+        attenuation: ArrayInput | Attenuation | None = None,
         shadow: Shadow | None = None,
+        incidence_cutoff: ArrayInput | None = None,
     ) -> None:
         set_field(self, "position", float_array("position", position, (3,)))
         _set_colors(self, ambient, diffuse, specular)
         _set_shadow(self, shadow)
         _set_attenuation(self, attenuation)
+        if incidence_cutoff is not None:
+            beyond = math.nextafter(math.pi / 2, 2) + 1e-7  # a right angle, also in float32
+            incidence_cutoff = real_number(
+                "incidence_cutoff", incidence_cutoff, above=0.0, below=beyond
+            )
+        set_field(self, "incidence_cutoff", incidence_cutoff)
 
 
 @pytree_dataclass
@@ -143,7 +192,7 @@ class SpotLight:
         diffuse: (3,) linear RGB, on the axis.
         specular: (3,), equal to `diffuse` unless given.
         ambient: (3,) or None; inside and outside of the cone alike.
-        attenuation: (3,) or None, as a `PointLight`'s.
+        attenuation: as a `PointLight`'s.
         shadow: how it casts shadows, or None for none.
 
     Raises:
@@ -156,7 +205,7 @@ class SpotLight:
     diffuse: Float[Array, "3"]
     specular: Float[Array, "3"]
     ambient: Float[Array, "3"] | None
-    attenuation: Float[Array, "3"] | None
+    attenuation: Float[Array, "3"] | Attenuation | None
     shadow: Shadow | None
 
     def __init__(
@@ -168,7 +217,7 @@ class SpotLight:
         ambient: ArrayInput | None = None,
         diffuse: ArrayInput = (1.0, 1.0, 1.0),
         specular: ArrayInput | None = None,
-        attenuation: ArrayInput | None = None,
+        attenuation: ArrayInput | Attenuation | None = None,
         shadow: Shadow | None = None,
     ) -> None:
         set_field(self, "position", float_array("position", position, (3,)))
@@ -198,8 +247,10 @@ def _set_colors(
     set_field(light, "specular", float_array("specular", specular, (3,)))
 
 
-def _set_attenuation(light: PointLight | SpotLight, attenuation: ArrayInput | None) -> None:
-    if attenuation is not None:
+def _set_attenuation(
+    light: PointLight | SpotLight, attenuation: ArrayInput | Attenuation | None
+) -> None:
+    if attenuation is not None and not isinstance(attenuation, Attenuation):
         attenuation = float_array("attenuation", attenuation, (3,))
     set_field(light, "attenuation", attenuation)
 
@@ -234,27 +285,53 @@ def needs_position(light: Light) -> bool:
     return isinstance(light, PointLight | SpotLight)
 
 
-def incoming(light: ShiningLight, position: Columns | None) -> tuple[Columns, Array | None]:
+def needs_viewer_distance(light: Light) -> bool:
+    """Whether the light at a point depends on how far away the viewer is."""
+    if isinstance(light, AmbientLight) or not isinstance(light.attenuation, Attenuation):
+        return False
+    return light.attenuation.legs != "light"
+
+
+def incoming(
+    light: ShiningLight, position: Columns | None, viewer_distance: Array | None = None
+) -> tuple[Columns, Array | None]:
     """Unit direction to the light, and the factor on its colours (None for one).
 
     Args:
         light: any but an ambient one.
         position: world positions as columns; may be None where `needs_position` is false.
+        viewer_distance: of those from the viewer; may be None where `needs_viewer_distance` is
+            false.
     """
     if isinstance(light, DirectionalLight):
         to_light = -normalize(light.direction)
-        return [to_light[i] for i in range(3)], None
+        factor = None
+        if light.attenuation is not None:
+            factor = _attenuated(light.attenuation, None, viewer_distance)
+        return [to_light[i] for i in range(3)], factor
     assert position is not None
     offset = [light.position[i] - position[i] for i in range(3)]
     direction, distance = normalize_columns(offset)
-    factor = None if light.attenuation is None else _attenuated(light.attenuation, distance)
+    factor = None
+    if light.attenuation is not None:
+        factor = _attenuated(light.attenuation, distance, viewer_distance)
     if isinstance(light, SpotLight):
         fade = _fade(light, direction)
         factor = fade if factor is None else fade * factor
     return direction, factor
 
 
-def _attenuated(attenuation: Array, distance: Array) -> Array:
+def _attenuated(
+    attenuation: Array | Attenuation, distance: Array | None, viewer_distance: Array | None
+) -> Array:
+    if isinstance(attenuation, Attenuation):
+        legs = {"light": (distance,), "viewer": (viewer_distance,)}
+        used = legs.get(attenuation.legs, (distance, viewer_distance))
+        attenuation = attenuation.coefficients
+    else:
+        used = (distance,)
+    known = [leg for leg in used if leg is not None]
+    distance = sum(known[1:], start=known[0])
     a, b, c = (attenuation[i] for i in range(3))
     divisor = a + distance * (b + distance * c)
     return jnp.where(divisor > 0, 1, 0) / jnp.where(divisor > 0, divisor, 1)

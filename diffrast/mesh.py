@@ -43,7 +43,10 @@ class Mesh:
         faces: three vertex ids each, counter-clockwise seen from outside.
         normals: unit vectors pointing out, or `None`; `with_normals` makes smooth ones, and
             `flat_shaded` those of the faces.
-        uvs: texture coordinates, v upwards, or `None`.
+        uvs: texture coordinates, v upwards, or `None`; one for each vertex, or any number of them
+            with `uv_faces`.
+        uv_faces: which of the uvs each corner of a face has (FEATURES X2), so that a vertex may
+            have several; `None` where it is the vertex's own.
         topology: which faces meet where, found from the vertices and faces where they are known,
             and kept by `dataclasses.replace(mesh, vertices=...)`; for other faces pass
             `topology=None`. A mesh that is made of traced vertices has none: rendering it finds
@@ -57,7 +60,8 @@ class Mesh:
     vertices: Float[Array, "vertices 3"]
     faces: Int[Array, "faces 3"]
     normals: Float[Array, "vertices 3"] | None
-    uvs: Float[Array, "vertices 2"] | None
+    uvs: Float[Array, "coordinates 2"] | None
+    uv_faces: Int[Array, "faces 3"] | None
     topology: Topology | None
 
     def __init__(
@@ -67,6 +71,7 @@ class Mesh:
         faces: ArrayInput,
         normals: ArrayInput | None = None,
         uvs: ArrayInput | None = None,
+        uv_faces: ArrayInput | None = None,
         topology: Topology | None = None,
     ) -> None:
         positions = _check.float_array("vertices", vertices, ("vertices", 3))
@@ -79,11 +84,18 @@ class Mesh:
         if normals is not None:
             normals = _check.float_array("normals", normals, (count, 3))
         if uvs is not None:
-            uvs = _check.float_array("uvs", uvs, (count, 2))
+            own = count if uv_faces is None else "coordinates"
+            uvs = _check.float_array("uvs", uvs, (own, 2))
+        if uv_faces is not None:
+            if uvs is None:
+                raise ValueError("uv_faces: wanted uvs that they count, got None")
+            shape = indices.shape
+            uv_faces = _check.index_array("uv_faces", uv_faces, shape, bound=uvs.shape[0])
         set_field(self, "vertices", positions)
         set_field(self, "faces", indices)
         set_field(self, "normals", normals)
         set_field(self, "uvs", uvs)
+        set_field(self, "uv_faces", uv_faces)
         if topology is None:
             topology = _topology_of(positions, indices)
         elif topology.patches.shape[0] != indices.shape[0]:
@@ -163,6 +175,7 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
         faces=mesh.faces,
         normals=normals,
         uvs=mesh.uvs,
+        uv_faces=mesh.uv_faces,
         topology=mesh.topology,
     )
 
@@ -178,7 +191,29 @@ def flat_shaded(mesh: Mesh) -> Mesh:
         vertices=mesh.vertices[corners],
         faces=jnp.arange(corners.shape[0]).reshape(-1, 3),
         normals=jnp.repeat(normals, 3, axis=0),
-        uvs=None if mesh.uvs is None else mesh.uvs[corners],
+        uvs=None if mesh.uvs is None else mesh.uvs[_uv_faces(mesh).reshape(-1)],
+    )
+
+
+def split_uvs(mesh: Mesh) -> Mesh:
+    """The same mesh with one uv a vertex: vertices with several are split; on the host.
+
+    What a file format or a program with one index array wants. Differentiate with respect to the
+    vertices of the result.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        return mesh
+    _, faces = _host_arrays(mesh.vertices, mesh.faces)
+    _, uv_faces = _host_arrays(mesh.uvs, mesh.uv_faces)
+    pairs, index = np.unique(
+        np.stack([faces, uv_faces], axis=-1).reshape(-1, 2), axis=0, return_inverse=True
+    )
+    vertex, uv = pairs.T
+    return Mesh(
+        vertices=mesh.vertices[vertex],
+        faces=jnp.asarray(index.reshape(-1, 3)),
+        normals=None if mesh.normals is None else mesh.normals[vertex],
+        uvs=mesh.uvs[uv],
     )
 
 
@@ -254,12 +289,19 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
                 f" {missing[0]}"
             )
     offsets = np.cumsum([0, *(mesh.vertices.shape[0] for mesh in meshes)])
+    uv_faces = None
+    if any(mesh.uv_faces is not None for mesh in meshes):
+        counts = [0 if mesh.uvs is None else mesh.uvs.shape[0] for mesh in meshes]
+        uv_faces = jnp.concatenate(
+            [_uv_faces(m) + int(n) for m, n in zip(meshes, np.cumsum([0, *counts]), strict=False)]
+        )
     faces = [mesh.faces + int(offset) for mesh, offset in zip(meshes, offsets, strict=False)]
     return Mesh(
         vertices=jnp.concatenate([mesh.vertices for mesh in meshes]),
         faces=jnp.concatenate(faces),
         normals=_joined([mesh.normals for mesh in meshes]),
         uvs=_joined([mesh.uvs for mesh in meshes]),
+        uv_faces=uv_faces,
     )
 
 
@@ -270,11 +312,16 @@ def transform(mesh: Mesh, matrix: ArrayInput) -> Mesh:
     faces round, so that they stay counter-clockwise from outside.
     """
     matrix = _check.float_array("matrix", matrix, (4, 4))
+
+    def turned(faces: Array) -> Array:
+        return jnp.where(mirrors(matrix), faces[:, ::-1], faces)
+
     return Mesh(
         vertices=transform_points(matrix, mesh.vertices),
-        faces=jnp.where(mirrors(matrix), mesh.faces[:, ::-1], mesh.faces),
+        faces=turned(mesh.faces),
         normals=None if mesh.normals is None else transform_normals(matrix, mesh.normals),
         uvs=mesh.uvs,
+        uv_faces=None if mesh.uv_faces is None else turned(mesh.uv_faces),
     )
 
 
@@ -295,18 +342,23 @@ def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
     vertices, faces = _host_arrays(mesh.vertices, mesh.faces)
     leader = _topology.clusters(vertices.astype(np.float64), distance)
     corners = leader[faces]
-    corners = corners[np.all(corners != np.roll(corners, 1, axis=1), axis=1)]
+    proper = np.all(corners != np.roll(corners, 1, axis=1), axis=1)
+    corners = corners[proper]
     used, first_use, index = np.unique(corners, return_index=True, return_inverse=True)
     order = np.argsort(first_use)
     kept = used[order]
     normals = None
     if mesh.normals is not None:
         normals = normalize(jnp.zeros_like(mesh.normals).at[leader].add(mesh.normals))[kept]
+    uvs, uv_faces = mesh.uvs, mesh.uv_faces
+    if uvs is not None and uv_faces is None:
+        uvs = uvs[kept]
     return Mesh(
         vertices=mesh.vertices[kept],
         faces=jnp.asarray(np.argsort(order)[index].reshape(-1, 3)),
         normals=normals,
-        uvs=None if mesh.uvs is None else mesh.uvs[kept],
+        uvs=uvs,
+        uv_faces=None if uv_faces is None else uv_faces[proper],
     )
 
 
@@ -364,6 +416,10 @@ def _host_arrays(vertices: Array, faces: Array) -> tuple[np.ndarray, np.ndarray]
             " host: call this outside jit, grad and vmap)"
         )
     return np.asarray(vertices), np.asarray(faces)
+
+
+def _uv_faces(mesh: Mesh) -> Array:
+    return mesh.faces if mesh.uv_faces is None else mesh.uv_faces
 
 
 def _joined(parts: Sequence[Array | None]) -> Array | None:

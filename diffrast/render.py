@@ -22,6 +22,7 @@ from diffrast.geometry import (
     clip_positions,
     flat_normals,
     scene_topology,
+    uvs_at,
     visible_points,
     world_geometry,
 )
@@ -31,6 +32,8 @@ from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
 from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
+from diffrast.texture import CubeTexture
+from diffrast.texturing import paint_scene, seams, skybox
 
 
 class Buffers(NamedTuple):
@@ -81,26 +84,21 @@ def render(
     """
     side = round(settings.samples**0.5)
     height, width = settings.height * side, settings.width * side
-    background = scene.background
-    if background.ndim == 3 and background.shape[:2] != (settings.height, settings.width):
-        raise ValueError(
-            f"background: wanted an image of {settings.height} rows and {settings.width} columns,"
-            f" got {background.shape[0]} and {background.shape[1]}"
-        )
-    if background.ndim == 3 and side > 1:
-        background = jnp.repeat(jnp.repeat(background, side, axis=0), side, axis=1)
+    border = 1 if settings.antialias and scene.objects else 0
+    background = _background(scene, camera, settings, border)
     if not scene.objects:
+        if isinstance(scene.background, CubeTexture):
+            return _pixels([background[..., c] for c in range(3)], side)
         return jnp.broadcast_to(scene.background, (settings.height, settings.width, 3))
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
     size, seen_clip = (height, width), clip
     if settings.antialias:  # a border of one pixel shows what lies beyond the edges there
         size, seen_clip = (height + 2, width + 2), with_border(clip, height, width, 1)
-        if background.ndim == 3:
-            background = jnp.pad(background, ((1, 1), (1, 1), (0, 0)), mode="edge")
     pixels = visible_points(geometry, seen_clip, *size, settings.cull_backfaces)
     with jax.named_scope("shade"):
         world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
+        world = world._replace(paints=paint_scene(scene, geometry, clip, height, width))
         color = SHADERS[settings.shading](world, pixels, reached)
         covered = pixels.face >= 0
         color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
@@ -111,9 +109,7 @@ def render(
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]
-    if side > 1:
-        color = [_box_average(channel, side) for channel in color]
-    return assemble(stored(color))
+    return _pixels(color, side)
 
 
 @jax.jit
@@ -124,7 +120,7 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
     """
     size = (settings.height, settings.width)
     if not scene.objects:
-        three = jnp.zeros((*size, 3), scene.background.dtype)
+        three = jnp.zeros((*size, 3), camera.view.dtype)
         nothing = jnp.full(size, -1, jnp.int32)
         shadows = sum(map(casts_shadow, scene.lights))
         lit = jnp.zeros((*size, shadows), three.dtype) if shadows else None
@@ -153,7 +149,7 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         inverse_depth=pixels.inverse_depth,
         position=stacked(at_points(geometry.positions, geometry, pixels)),
         normal=stacked(normal),
-        uv=None if geometry.uvs is None else stacked(at_points(geometry.uvs, geometry, pixels)),
+        uv=None if geometry.uvs is None else stacked(uvs_at(geometry, pixels)),
         lit=stacked(lit_parts) if lit_parts else None,
     )
 
@@ -208,6 +204,8 @@ def _with_edges(
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
     elif world.shadows is not None:
         apart = apart | terminators(world.shadows, topology.edges)
+    if world.paints:
+        apart = apart | seams(world.scene, world.paints, topology.edges)
     view = View(
         positions_clip=positions_clip,
         faces=geometry.faces,
@@ -241,6 +239,32 @@ def _glow_at(shading: str) -> Glow:
         return glow(shading, world, light, Points(face, at, jnp.zeros_like(at[0])))
 
     return shade
+
+
+def _background(scene: Scene, camera: Camera, settings: RenderSettings, border: int) -> Array:
+    """What is seen where there is no object: a colour, or an image of all samples and a border."""
+    side = round(settings.samples**0.5)
+    background = scene.background
+    if isinstance(background, CubeTexture):
+        height, width = settings.height * side, settings.width * side
+        return skybox(background, camera, height, width, border)
+    if background.ndim == 1:
+        return background
+    if background.shape[:2] != (settings.height, settings.width):
+        raise ValueError(
+            f"background: wanted an image of {settings.height} rows and {settings.width} columns,"
+            f" got {background.shape[0]} and {background.shape[1]}"
+        )
+    if side > 1:
+        background = jnp.repeat(jnp.repeat(background, side, axis=0), side, axis=1)
+    return jnp.pad(background, ((border, border), (border, border), (0, 0)), mode="edge")
+
+
+def _pixels(color: Columns, side: int) -> Array:
+    """The image of pixels from the colours of side × side samples of each."""
+    if side > 1:
+        color = [_box_average(channel, side) for channel in color]
+    return assemble(stored(color))
 
 
 def _box_average(channel: Array, side: int) -> Array:

@@ -19,12 +19,15 @@ from diffrast.light import (
     DirectionalLight,
     Light,
     casts_shadow,
+    dot_columns,
+    needs_viewer_distance,
     normalize_columns,
     without_ambient,
 )
 from diffrast.scene import Scene
 from diffrast.shade import Reflectance, Surface, needs, phong
 from diffrast.shadows import Reached, Shadows, cast, outlines, receive
+from diffrast.texturing import Paints, texel_colors
 
 
 class World(NamedTuple):
@@ -34,6 +37,7 @@ class World(NamedTuple):
     camera: Camera
     geometry: Geometry
     shadows: Shadows | None
+    paints: Paints = ()
 
 
 def cast_shadows(
@@ -50,7 +54,7 @@ def cast_outlines(
     world: World, topology: Topology, points: Points, reached: Reached
 ) -> Cast | None:
     """The outlines of shadows between the pixels of an image; None without shadows."""
-    scene, camera, geometry, shadows = world
+    scene, camera, geometry, shadows = world[:4]
     if shadows is None:
         return None
     casting = [light for light in scene.lights if casts_shadow(light)]
@@ -98,22 +102,28 @@ def glow(shading: str, world: World, light: Array, points: Points) -> Columns:
 
 
 def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
-    scene, camera, geometry, _ = world
+    scene, camera, geometry = world[:3]
     if geometry.normals is None:
         normal = flat_normals(geometry, points.face)
     else:
         normal = at_points(geometry.normals, geometry, points)
     reflectance = _reflectance(scene, geometry.object_of_face, points.face)
+    texel = texel_colors(scene, world.paints, geometry, points)
+    if texel is not None:
+        reflectance = reflectance._replace(
+            ambient=_times(reflectance.ambient, texel), diffuse=_times(reflectance.diffuse, texel)
+        )
     with_position, with_viewer = needs(scene.lights, reflectance.specular is not None)
     position = at_points(geometry.positions, geometry, points) if with_position else None
     to_viewer = _to_viewer(camera, position) if with_viewer else None
-    surface = Surface(normal, position, to_viewer)
+    distance = _viewer_distance(scene.lights, camera, position)
+    surface = Surface(normal, position, to_viewer, distance)
     return phong(surface, reflectance, scene.lights, reached)
 
 
 def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     """Interpolate the colours of vertices; of each light with shadows apart, which are sharp."""
-    scene, camera, geometry, _ = world
+    scene, camera, geometry = world[:3]
     assert geometry.normals is not None
     vertices = jnp.arange(geometry.positions.shape[0])
     reflectance = _reflectance(scene, geometry.object_of_vertex, vertices)
@@ -121,9 +131,21 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     normal = [geometry.normals[:, i] for i in range(3)]
     _, with_viewer = needs(scene.lights, reflectance.specular is not None)
     to_viewer = _to_viewer(camera, position) if with_viewer else None
-    surface = Surface(normal, position, to_viewer)
+    distance = _viewer_distance(scene.lights, camera, position)
+    surface = Surface(normal, position, to_viewer, distance)
+    texel = texel_colors(scene, world.paints, geometry, points)
 
     def at_vertices(lights: tuple[Light, ...]) -> Columns:
+        if texel is None:
+            return interpolated(reflectance, lights)
+        color = _times(interpolated(reflectance._replace(specular=None), lights), texel)
+        if reflectance.specular is None:
+            return color
+        black = [jnp.zeros_like(texel[0], shape=())] * 3
+        shine = interpolated(reflectance._replace(ambient=black, diffuse=black), lights)
+        return [c + s for c, s in zip(color, shine, strict=True)]
+
+    def interpolated(reflectance: Reflectance, lights: tuple[Light, ...]) -> Columns:
         color = phong(surface, reflectance, lights)
         return at_points(jnp.stack(color, axis=-1), geometry, points)
 
@@ -145,6 +167,9 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
 def _shade_unlit(world: World, points: Points, reached: Reached) -> Columns:
     scene, geometry = world.scene, world.geometry
     diffuse = _reflectance(scene, geometry.object_of_face, points.face).diffuse
+    texel = texel_colors(scene, world.paints, geometry, points)
+    if texel is not None:
+        diffuse = _times(diffuse, texel)
     return [jnp.broadcast_to(channel, points.face.shape) for channel in diffuse]
 
 
@@ -162,6 +187,22 @@ def _to_viewer(camera: Camera, position: Columns | None) -> Columns:
     return normalize_columns([eye[i] - eye[3] * position[i] for i in range(3)])[0]
 
 
+def _viewer_distance(
+    lights: tuple[Light, ...], camera: Camera, position: Columns | None
+) -> Array | None:
+    """Distance of points from the origin of the eye system, if a light asks for it."""
+    if not any(map(needs_viewer_distance, lights)):
+        return None
+    assert position is not None
+    view = camera.view
+    eye = [dot_columns(view[i], position) + view[i, 3] for i in range(3)]
+    return normalize_columns(eye)[1]
+
+
+def _times(colors: Columns, texel: Columns) -> Columns:
+    return [a * b for a, b in zip(colors, texel, strict=True)]
+
+
 def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
     """Material at each point: numbers if there is one object, else looked up by object."""
     materials = [item.material for item in scene.objects]
@@ -173,6 +214,7 @@ def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
             [material.diffuse[c] for c in range(3)],
             None if material.specular is None else [material.specular[c] for c in range(3)],
             material.shininess if specular else None,
+            material.highlight == "blinn",
         )
     which = object_of[jnp.maximum(index, 0)]
 
@@ -180,7 +222,9 @@ def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
         table = jnp.stack(values)
         return [table[:, c][which] for c in range(3)]
 
-    none = jnp.zeros(3, scene.background.dtype)
+    none = jnp.zeros_like(materials[0].diffuse)
+    blinn = [m.highlight == "blinn" for m in materials if m.specular is not None]
+    mixed = jnp.array([m.highlight == "blinn" for m in materials])
     return Reflectance(
         looked_up([m.ambient for m in materials]),
         looked_up([m.diffuse for m in materials]),
@@ -188,4 +232,5 @@ def _reflectance(scene: Scene, object_of: Array, index: Array) -> Reflectance:
         if specular
         else None,
         jnp.stack([m.shininess for m in materials])[which] if specular else None,
+        mixed[which] if len(set(blinn)) > 1 else all(blinn),
     )

@@ -3,8 +3,10 @@
 import json
 
 import fit_light_from_shadow
+import fit_materials
 import fit_pose
 import fit_shape
+import fit_texture
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +39,26 @@ def test_a_light_is_found_from_its_shadow(tmp_path):
     assert row["found"]["degrees"] < 0.5
     assert json.loads((tmp_path / "fit_light_from_shadow.json").read_text())["seed"] == 0
     assert (tmp_path / "fit_direction_from_shadow.png").is_file()
+
+
+def test_a_texture_is_found_from_views(tmp_path):
+    report = fit_texture.run(tmp_path, size=24, views=4, rows=8, steps=60)
+    assert report["found"]["mean_seen"] < 0.2 * report["at_start"]["mean_seen"]
+    assert json.loads((tmp_path / "fit_texture.json").read_text())["texels"] == [8, 16]
+    assert (tmp_path / "fit_texture.png").is_file()
+
+
+def test_materials_are_found_with_lights_but_for_their_scales(tmp_path):
+    report = fit_materials.run(tmp_path, size=32, steps=12, noise=0.0)
+    for name, error in report["errors"].items():
+        assert error < 0.05, name
+    # Three channels' scales, the lamp's strength against its attenuation, a direction's length.
+    exact = [item for item in report["unidentifiable"] if item["moved_by_noise"] > 100]
+    assert len(exact) == 5
+    direction = {f"direction[{i}]" for i in range(3)}
+    assert any(set(item["parameters"]) == direction for item in exact)
+    assert json.loads((tmp_path / "fit_materials.json").read_text())["parameters"] == 41
+    assert (tmp_path / "fit_materials.png").is_file()
 
 
 def test_distances_are_those_along_the_normal():

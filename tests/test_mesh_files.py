@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import diffrast as dr
 from diffrast import mesh as dm
 from diffrast import shapes
 from diffrast.files.meshes import SUFFIXES, load_mesh, load_mesh_parts, save_mesh
+from diffrast.files.objects import load_objects
 
 MODELS = Path(__file__).parents[1] / ".." / "shared" / "data" / "meshes"
 HOLDS_NORMALS = (".obj", ".ply", ".glb", ".gltf")
@@ -157,6 +159,57 @@ def test_materials_and_textures(tmp_path):
     np.testing.assert_array_equal(load_mesh(path).faces, [[0, 1, 2], [0, 2, 3]])
     (tmp_path / "m.mtl").unlink()
     assert all(part.diffuse is None for part in load_mesh_parts(path))
+
+
+def test_objects_of_a_file_carry_its_materials(tmp_path):
+    Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8)).save(tmp_path / "t.png")
+    write(
+        tmp_path / "m.mtl",
+        "newmtl one\nKd .8 .7 .6\nKs 0 0 0\nmap_Kd t.png\nnewmtl two\nKd 0 0 1\nKs 1 .5 1\nNs 20\n"
+        "newmtl three\nmap_Kd t.png\n",
+    )
+    faces = "usemtl one\nf 1/1 2/1 3/1\nusemtl two\nf 1/1 3/1 4/1\nusemtl three\nf 1/1 2/1 4/1\n"
+    path = write(tmp_path / "a.obj", "mtllib m.mtl\n" + QUAD + "vt .75 .5\n" + faces)
+    one, two, three = load_objects(path, filter="trilinear", wrap="clamp")
+    np.testing.assert_allclose(one.material.diffuse, [0.8, 0.7, 0.6], rtol=1e-6)
+    assert one.material.specular is None
+    assert one.material.texture is three.material.texture
+    assert (one.material.texture.filter, one.material.texture.wrap) == ("trilinear", ("clamp",) * 2)
+    color = dr.sample_texture(one.material.texture, one.mesh.uvs[0])
+    np.testing.assert_allclose(color, [0, 0.502886, 0], atol=1e-5)
+    np.testing.assert_allclose(three.material.diffuse, 1)
+    assert two.material.texture is None
+    assert two.material.shininess == 20
+    np.testing.assert_allclose(two.material.specular, [1, 0.5, 1])
+    assert dr.Scene(objects=[one, two, three]).shared == (0, 1, 0)
+    assert one.mesh.normals is not None
+
+
+def test_gltf_textures_arrive_in_objects(tmp_path):
+    picture = Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8))
+    picture.save(tmp_path / "t.png")
+    save_mesh(tmp_path / "a.gltf", shapes.plane())
+    tree = json.loads((tmp_path / "a.gltf").read_text())
+    base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.2, 0.4, 1, 1]}
+    tree["materials"] = [{"pbrMetallicRoughness": base}]
+    tree["textures"], tree["images"] = [{"source": 0}], [{"uri": "t.png"}]
+    (item,) = load_objects(write(tmp_path / "b.gltf", json.dumps(tree)))
+    np.testing.assert_allclose(item.material.diffuse, [0.2, 0.4, 1], atol=1 / 255)
+    image = item.material.texture.image
+    np.testing.assert_allclose(image, [[[1, 0, 0], [0, 0.502886, 0]]], atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_uvs_with_their_own_indices_are_written(tmp_path, suffix):
+    square = shapes.plane()
+    own = dm.Mesh(
+        vertices=square.vertices, faces=square.faces, uvs=[(0, 0), (1, 0), (0, 1), (1, 1), (2, 0)],
+        uv_faces=[(0, 1, 3), (4, 2, 0)],
+    )  # fmt: skip
+    save_mesh(tmp_path / f"a{suffix}", own)
+    read = load_mesh(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(read.vertices[read.faces], own.vertices[own.faces], atol=1e-6)
+    np.testing.assert_allclose(read.uvs[read.faces], own.uvs[own.uv_faces], atol=1e-6)
 
 
 # ---------------------------------------------------------------------------------- other formats

@@ -11,6 +11,7 @@ from derivatives import check_derivatives
 
 from diffrast.light import (
     AmbientLight,
+    Attenuation,
     DirectionalLight,
     PointLight,
     SpotLight,
@@ -50,7 +51,11 @@ def columns(vectors):
 def reflectance_of(material):
     specular = None if material.specular is None else columns(material.specular)
     return Reflectance(
-        columns(material.ambient), columns(material.diffuse), specular, material.shininess
+        columns(material.ambient),
+        columns(material.diffuse),
+        specular,
+        material.shininess,
+        material.highlight == "blinn",
     )
 
 
@@ -137,6 +142,25 @@ def test_a_spot_fades_towards_its_cutoff(cutoff):
     np.testing.assert_allclose(dimmed, want / 4, atol=1e-6)
 
 
+def test_attenuation_by_the_legs_of_the_way():
+    """Linear 1 / (r + k) and inverse square (FEATURES S3), over one leg or both."""
+    _, position, _ = random_points(20)
+    leg = np.linalg.norm(np.asarray(POINT["position"]) - position, axis=1)
+    other = np.linspace(1, 5, 20)
+    for legs, r in (("light", leg), ("viewer", other), ("both", leg + other)):
+        for coefficients, want in (((0.7, 1, 0), 1 / (r + 0.7)), ((0, 0, 1), 1 / r**2)):
+            attenuation = Attenuation(coefficients, legs=legs)
+            _, factor = incoming(
+                PointLight(**POINT, attenuation=attenuation), columns(position), jnp.asarray(other)
+            )
+            np.testing.assert_allclose(factor, want, rtol=1e-5)
+    sun = DirectionalLight(direction=(0, 0, -1), attenuation=Attenuation((1, 1, 0), legs="viewer"))
+    np.testing.assert_allclose(
+        incoming(sun, None, jnp.asarray(other))[1], 1 / (1 + other), rtol=1e-6
+    )
+    assert needs((sun,), specular=False) == (True, False)
+
+
 def test_total_ambient_is_the_sum_over_all_lights():
     dark = DirectionalLight(direction=(0, 0, 1))
     assert total_ambient(()) is None
@@ -174,6 +198,31 @@ def test_lambert_and_the_highlight_in_closed_form(angle):
     lambert, highlight = np.cos(angle), np.cos(away) ** 5
     want = lambert * np.array([0.8, 0.3, 0]) + highlight * np.array([0, 0.125, 0.5])
     np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.5])
+def test_blinns_highlight_in_closed_form(angle):
+    light = DirectionalLight(direction=-towards(angle), diffuse=(0, 0, 0), specular=(1, 0.5, 0))
+    material = Material(specular=(0.5, 0.5, 0.5), shininess=5.0, highlight="blinn")
+    half = (angle - 0.7) / 2  # between light and viewer
+    got = shade_one(to_viewer=towards(-0.7), material=material, lights=(light,))
+    want = max(np.cos(half), 0) ** 5 * np.array([0.5, 0.25, 0])
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("cutoff", [1e-3, 0.5, np.pi / 2])
+def test_a_spot_by_incidence(cutoff):
+    """1 - (1 - cos a) / (1 - cos cutoff) instead of cos a; highlights where that is not zero."""
+    material = Material(diffuse=(1, 1, 1), specular=(1, 1, 1), shininess=0.0)
+    for share in (0.0, 0.4, 0.9, 1.1):
+        angle = share * cutoff
+        light = PointLight(
+            position=3 * towards(angle), diffuse=(1, 0, 0), specular=(0, 1, 0),
+            incidence_cutoff=cutoff,
+        )  # fmt: skip
+        got = shade_one(to_viewer=towards(-angle), material=material, lights=(light,))
+        want = 1 - (np.sin(angle / 2) / np.sin(cutoff / 2)) ** 2
+        np.testing.assert_allclose(got, [max(want, 0), share < 1, 0], atol=2e-4)
 
 
 def test_a_surface_that_faces_away_gets_its_ambient_part_only():
@@ -246,7 +295,15 @@ def test_derivatives_in_everything():
             diffuse=(0.3, 0.5, 0.9), ambient=(0.4, 0.1, 0.2), specular=(1, 0.7, 0.5), shininess=7.0
         )
         lights = (*three_lights(attenuation=(0.5, 0.25, 0.125)), SpotLight(**SPOT))
-        check_derivatives(shaded, normal, position, to_viewer, material, lights)
+        blinn = dataclasses.replace(material, highlight="blinn")
+        narrow = (PointLight(**POINT, incidence_cutoff=1.4), DirectionalLight(**DIRECTIONAL))
+
+        def both(normal, position, to_viewer, materials, lights):
+            points = normal, position, to_viewer
+            return [shaded(*points, *pair) for pair in zip(materials, lights, strict=True)]
+
+        arguments = (material, blinn), (lights, narrow)
+        check_derivatives(both, normal, position, to_viewer, *arguments)
 
 
 HEAD_ON = {"normal": (0, 0, 1), "to_viewer": (0, 0, 1), "light": (0, 0, -1)}
@@ -291,10 +348,12 @@ def jacobians():
                 cutoff=parameters["cutoff"],
                 attenuation=parameters["attenuation"],
             ),
+            PointLight(position=parameters["spot"], incidence_cutoff=parameters["cutoff"]),
         )
         material = Material(specular=(1, 1, 1), shininess=parameters["shininess"])
-        vectors = (parameters[name][None] for name in ("normal", "position", "to_viewer"))
-        return shaded(*vectors, material, lights)[0]
+        vectors = [parameters[name][None] for name in ("normal", "position", "to_viewer")]
+        blinn = dataclasses.replace(material, highlight="blinn")
+        return shaded(*vectors, material, lights)[0] + shaded(*vectors, blinn, lights)[0]
 
     def derivatives(parameters):
         ones = jax.tree.map(jnp.ones_like, parameters)
@@ -374,6 +433,17 @@ def test_precision_is_that_of_the_input():
         ),
         (lambda: SpotLight(**{**SPOT, "cutoff": 0.0}), "cutoff: wanted a number between 0"),
         (lambda: SpotLight(**{**SPOT, "direction": (0, 1)}), r"direction: wanted shape \(3,\)"),
+        (
+            lambda: PointLight(position=(0, 0, 0), incidence_cutoff=1.6),
+            "incidence_cutoff: wanted a number between 0 and 1.5708, got 1.6",
+        ),
+        (lambda: Attenuation((1, 2)), r"coefficients: wanted shape \(3,\), got \(2,\)"),
+        (lambda: Attenuation((1, 0, 0), legs="three"), "legs: wanted one of light, both, viewer"),
+        (
+            lambda: DirectionalLight(direction=(0, 0, 1), attenuation=Attenuation((1, 0, 0))),
+            "attenuation: wanted an Attenuation of legs \"viewer\", got 'light'",
+        ),
+        (lambda: Material(highlight="cone"), "highlight: wanted one of phong, blinn, got 'cone'"),
         (lambda: Material(diffuse=(1, 2)), r"diffuse: wanted shape \(3,\), got \(2,\)"),
         (lambda: Material(ambient=(1, np.nan, 2)), "ambient: wanted finite numbers, got nan"),
         (lambda: Material(specular=1.0), r"specular: wanted shape \(3,\), got \(\)"),

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from diffrast.color import srgb_to_linear
 from diffrast.files._mesh_text import check_ascii_ply, check_ascii_stl, check_off, plain_obj
 from diffrast.linalg import normalize
-from diffrast.mesh import Mesh, merge, transform, with_normals
+from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
@@ -76,7 +76,8 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh in the format that the file's suffix names.
 
-    OBJ, PLY, glTF and GLB hold normals and texture coordinates, OFF and STL only faces. Text
+    OBJ, PLY, glTF and GLB hold normals and texture coordinates, OFF and STL only faces; all but OBJ
+    split vertices that have several texture coordinates. Text
     formats have enough digits to read the same numbers back; binary ones hold float32.
 
     Raises:
@@ -244,12 +245,14 @@ def _obj_text(mesh: Mesh) -> str:
     corner = "{0}"
     if mesh.uvs is not None:
         lines += _rows("vt ", mesh.uvs)
-        corner = "{0}/{0}"
+        corner = "{0}/{1}"
     if mesh.normals is not None:
         lines += _rows("vn ", mesh.normals)
-        corner = "{0}/{0}/{0}" if mesh.uvs is not None else "{0}//{0}"
-    for face in (np.asarray(mesh.faces) + 1).tolist():
-        lines.append("f " + " ".join(corner.format(index) for index in face))
+        corner = "{0}/{1}/{0}" if mesh.uvs is not None else "{0}//{0}"
+    uv_faces = mesh.faces if mesh.uv_faces is None else mesh.uv_faces
+    both = np.stack([np.asarray(mesh.faces), np.asarray(uv_faces)], axis=-1) + 1
+    for face in both.tolist():
+        lines.append("f " + " ".join(corner.format(*indices) for indices in face))
     return "\n".join([*lines, ""])
 
 
@@ -268,6 +271,7 @@ def _rows(start: str, values: Any) -> list[str]:
 
 def _exported(trimesh: ModuleType, mesh: Mesh, suffix: str) -> bytes:
     visual = None
+    mesh = split_uvs(mesh)
     if mesh.uvs is not None:
         visual = trimesh.visual.TextureVisuals(uv=np.asarray(mesh.uvs))
     geometry = trimesh.Trimesh(

@@ -17,6 +17,8 @@ from diffrast.lines.drawing import draw_lines_with_depth
 from diffrast.mesh import Mesh, vertex_normals
 from diffrast.raster import rasterize
 from diffrast.scene import Object, Scene
+from diffrast.texture import CubeTexture
+from diffrast.texturing import skybox
 
 _FLAT = 1e-5  # sine of the angle between the planes of two faces that count as one polygon
 
@@ -145,10 +147,12 @@ def wireframe(
             lines.append(part.lines + first)
             colors.append(jnp.broadcast_to(item.material.diffuse, (part.lines.shape[0], 3)))
             first += part.points.shape[0]
-    size = {"height": height, "width": width}
+    height, width = _check.positive_int("height", height), _check.positive_int("width", width)
+    background, size = scene.background, {"height": height, "width": width}
+    if isinstance(background, CubeTexture):
+        background = skybox(background, camera, height, width)
     if not points:
-        height, width = (_check.positive_int(name, value) for name, value in size.items())
-        return jnp.broadcast_to(scene.background, (height, width, 3))
+        return jnp.broadcast_to(background, (height, width, 3))
     positions_clip = world_to_clip(camera, jnp.concatenate(points))
     joined = jnp.concatenate(faces)
     fragments = None
@@ -161,7 +165,7 @@ def wireframe(
         **size,
         faces=None if hidden else joined,
         fragments=fragments,
-        background=scene.background,
+        background=background,
         line_width=line_width,
         antialias=antialias,
     )

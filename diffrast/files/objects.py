@@ -1,0 +1,58 @@
+"""Mesh files with their materials and textures, as objects of a scene (FEATURES G9, X4)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from diffrast.files.meshes import MeshPart, load_mesh_parts
+from diffrast.material import Material
+from diffrast.mesh import with_normals
+from diffrast.scene import Object
+from diffrast.texture import Texture
+
+
+def load_objects(
+    path: str | Path, *, filter: str = "bilinear", wrap: str | tuple[str, str] = "repeat"
+) -> list[Object]:
+    """Read a mesh file as objects, one for each of its materials.
+
+    An OBJ file's MTL gives ambient, diffuse and specular reflectance (Ka, Kd, Ks), shininess (Ns)
+    and texture (map_Kd); glTF the base colour and its texture. Pictures are decoded from sRGB to
+    linear, without their alpha; what the file does not say is as in `Material()`, but that a
+    texture without a colour is shown as it is, and a highlight of no colour is none. Parts with
+    one picture share one `Texture`. Meshes without normals get smooth ones.
+
+    Args:
+        path: the file, as for `load_mesh`.
+        filter: of the textures.
+        wrap: likewise.
+
+    Raises:
+        As `load_mesh`.
+    """
+    textures: dict[tuple[object, ...], Texture] = {}
+
+    def texture_of(part: MeshPart) -> Texture | None:
+        if part.texture is None or part.mesh.uvs is None:
+            return None
+        picture = np.ascontiguousarray(part.texture[..., :3])
+        key = (picture.shape, picture.tobytes())
+        if key not in textures:
+            textures[key] = Texture(picture, filter=filter, wrap=wrap)
+        return textures[key]
+
+    objects = []
+    for part in load_mesh_parts(path):
+        texture = texture_of(part)
+        given = {
+            name: getattr(part, name)
+            for name in ("ambient", "diffuse", "specular", "shininess")
+            if getattr(part, name) is not None
+        }
+        if texture is not None:
+            given.setdefault("diffuse", (1.0, 1.0, 1.0))
+        if not np.any(given.get("specular", 0)):
+            given.pop("specular", None)
+        mesh = part.mesh if part.mesh.normals is not None else with_normals(part.mesh)
+        objects.append(Object(mesh, Material(texture=texture, **given)))
+    return objects
