@@ -3,7 +3,7 @@
 import argparse
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from diffrast import fit, linalg, shapes
-from diffrast.camera import Camera
+from diffrast.camera import Camera, stack_cameras
 from diffrast.color import linear_to_srgb
 from diffrast.files import (
     load_bezier,
@@ -30,6 +30,7 @@ from diffrast.render import render
 from diffrast.scene import Object, Scene
 from diffrast.scene_files import render_scene_file
 from diffrast.settings import RenderSettings
+from diffrast.views import image_of, stream_views
 
 T = TypeVar("T")
 
@@ -82,11 +83,14 @@ def orbit_command(options: argparse.Namespace) -> str:
     framing = _framing(options, mesh)
     scene, settings = _scene(options, mesh), _settings(options)
     up = framing.up / np.linalg.norm(framing.up)
-    frames = []
-    for k in _with_progress(range(options.frames), options):
+    cameras = []
+    for k in range(options.frames):
         turn = np.asarray(linalg.rotation(up, 2 * np.pi * k / options.frames))[:3, :3]
         eye = framing.target + turn @ (framing.eye - framing.target)
-        frames.append(render(scene, _camera(options, framing._replace(eye=eye)), settings))
+        cameras.append(_camera(options, framing._replace(eye=eye)))
+    stream = stream_views(image_of, stack_cameras(cameras), (scene, settings))
+    images = (image for _, some in stream for image in some)
+    frames = list(_with_progress(images, options, options.frames))
     save_animation(options.out, frames, frames_per_second=options.fps)
     return f"{options.out}: {len(frames)} pictures"
 
@@ -317,8 +321,10 @@ def _written(path: Path, image: Array) -> str:
     return f"{path}: {image.shape[1]} by {image.shape[0]} pixels"
 
 
-def _with_progress(items: Sequence[T], options: argparse.Namespace) -> Iterator[T]:
-    """The items, with a progress bar where tqdm is installed and it is wanted."""
+def _with_progress(
+    items: Iterable[T], options: argparse.Namespace, total: int | None = None
+) -> Iterator[T]:
+    """The items, with a progress bar if it is wanted; `total` if they do not tell how many."""
     if options.quiet:
         yield from items
         return
@@ -328,4 +334,4 @@ def _with_progress(items: Sequence[T], options: argparse.Namespace) -> Iterator[
         raise ImportError(
             "progress needs tqdm: install diffrast[progress], or pass --quiet"
         ) from error
-    yield from tqdm(items)
+    yield from tqdm(items, total=total)

@@ -77,10 +77,11 @@ def render_views(
             f"cameras: wanted a stack, with views of shape (views, 4, 4), got shape"
             f" {jnp.shape(cameras.view)}"
         )
-    return map_views(_image, cameras, (scene, settings), chunk=chunk, devices=devices)
+    return map_views(image_of, cameras, (scene, settings), chunk=chunk, devices=devices)
 
 
-def _image(shared: tuple[Scene, RenderSettings], camera: Camera) -> Array:
+def image_of(shared: tuple[Scene, RenderSettings], camera: Camera) -> Array:
+    """What `render_views` does with each view, for `stream_views`: `render` of a scene."""
     scene, settings = shared
     return render(scene, camera, settings)
 
@@ -132,7 +133,8 @@ def stream_views(
 
     Not more than a chunk for each core or device, and one, is kept in memory::
 
-        for which, images in dr.views.stream_views(image, cameras, scene, chunk=8):
+        shared = scene, settings
+        for which, images in dr.views.stream_views(dr.views.image_of, cameras, shared):
             for number, picture in zip(which, images):
                 dr.save_image(f"{number:04}.png", picture)
 

@@ -1,5 +1,6 @@
 """Annotations of the library are checked at every call; plots need no display."""
 
+import jax
 import jaxtyping
 import matplotlib
 import pytest
@@ -11,6 +12,13 @@ check_annotations = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 install_import_hook("diffrast", f"{__name__}.check_annotations")
 matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs of one file are of no use to the next; a process can map so many only."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

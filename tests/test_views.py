@@ -42,7 +42,7 @@ def test_views_are_those_of_single_calls(singles, options):
 
 def test_they_come_in_order_a_chunk_at_a_time(singles):
     seen = []
-    stream = views.stream_views(views._image, CAMERAS, (scene(), SETTINGS), chunk=4)
+    stream = views.stream_views(views.image_of, CAMERAS, (scene(), SETTINGS), chunk=4)
     for which, images in stream:
         assert len(which) == len(images) <= 4
         np.testing.assert_array_equal(images, singles[which.start : which.stop])
