@@ -5,16 +5,14 @@ sorts faces into tiles: a block of pixels stays in the first cache level, nothin
 work list has a capacity. The loops are `lax` loops, compiled, over vectorised blocks:
 
 * faces of up to 24×32 pixels: one block each, of the smallest size in `BLOCKS` that holds it;
-* large faces: rows of tiles, each row only as wide as the edges leave it, without the tiles that
-  are known to be hidden by what is drawn already;
-* wide faces (see `fixed_point`): the same sweep with edges from homogeneous coordinates, and the
-  near and far plane tested at every pixel.
+* all others: rows of tiles, each row only as wide as the edges leave it, without the tiles that are
+  known to be hidden by what is drawn already. Vertices may lie behind the eye, and the near and the
+  far plane are tested at every pixel.
 
 Each pixel holds its depth key and face id as the two parts of one complex number, so that one store
 updates both; the id is kept as the bits of a normal float.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -33,14 +31,12 @@ from diffrast.raster.edge_functions import (
     each_edge,
     edge_value,
     evaluate,
-    set_up_large,
-    set_up_wide,
+    set_up,
     triangle_slopes,
 )
 from diffrast.raster.fixed_point import (
     BLOCKS,
     LARGE,
-    WIDE,
     Vertices,
     classify_faces,
     first_centre,
@@ -102,11 +98,8 @@ def _draw(
             buffer = _draw_blocks(
                 buffer, vertices, faces, order, (starts[size], starts[size + 1]), block, image
             )
-        wide = partial(set_up_wide, cull_backfaces=cull_backfaces)
-        for size, set_up in ((LARGE, set_up_large), (WIDE, wide)):
-            buffer = _draw_sweeps(
-                buffer, vertices, faces, order, (starts[size], starts[size + 1]), image, set_up
-            )
+        span = starts[LARGE], starts[LARGE + 1]
+        buffer = _draw_sweeps(buffer, vertices, faces, order, span, image, cull_backfaces)
         return _face_ids(buffer)[:height, :width], buffer.real[:height, :width]
 
     return draw(positions_clip, faces)
@@ -208,7 +201,7 @@ def _draw_blocks(
     return lax.fori_loop(*span, draw, buffer)
 
 
-# Large and wide faces -----------------------------------------------------------------------------
+# Faces of any size --------------------------------------------------------------------------------
 
 
 def _draw_sweeps(
@@ -218,7 +211,7 @@ def _draw_sweeps(
     order: Array,
     span: tuple[Array, Array],
     image: Image,
-    set_up: Callable[[Vertices, Image], Sweep],
+    cull_backfaces: bool,
 ) -> Array:
     """Draw faces of any size: rows of tiles, each as wide as the edges leave it.
 
@@ -233,7 +226,7 @@ def _draw_sweeps(
         start = first + n * CHUNK
         slots = start + jnp.arange(CHUNK)
         chunk = order[jnp.minimum(slots, order.shape[0] - 1)]
-        sweeps = set_up(corners_of(vertices, faces, chunk), image)
+        sweeps = set_up(corners_of(vertices, faces, chunk), image, cull_backfaces)
         walk = _plan_walk(sweeps, slots < stop, image)
 
         def hidden(tile: Array, lowest_keys: Array) -> Array:
@@ -262,10 +255,9 @@ def _draw_sweeps(
                 for plane in zip(*sweep.planes, strict=True)
             )
             key = jnp.clip(key, *sweep.key_range)
-            inside = outside >= 0
             for limit in limits:
-                inside = inside & (limit >= 0)
-            buffer = _resolve(buffer, (row, column), inside, key, chunk[i])
+                outside = outside | jnp.where(limit >= 0, 0, -1)
+            buffer = _resolve(buffer, (row, column), outside >= 0, key, chunk[i])
             lowest = _smallest(lax.dynamic_slice(buffer, (row, column), TILE).real)
             lowest_keys = lowest_keys.at[tile_row, tile_column].set(lowest)
             tile = lax.while_loop(

@@ -15,8 +15,10 @@ from jax.typing import ArrayLike
 
 from diffrast._compensated import difference_of_products
 from diffrast.raster.fixed_point import (
+    FAR,
     GUARD_BITS,
     IRREGULAR,
+    NEAR,
     Vertices,
     first_centre,
     maximum3,
@@ -106,35 +108,8 @@ def _anchored_edge(x: Array, y: Array, a: Array, b: Array, sign: Array, image: I
     return Edge(a, b, k, x / steps, y / steps, run)
 
 
-def set_up_large(corners: Vertices, image: Image) -> Sweep:
-    """Regular vertices: exact edges, key affine on the screen."""
-    x_fixed, y_fixed = list(corners.x_fixed), list(corners.y_fixed)
-    sign = twice_area_sign(x_fixed, y_fixed)
-    start, end = _edge_ends(corners)
-    edges = _anchored_edge(
-        start.x_fixed,
-        start.y_fixed,
-        start.y_fixed - end.y_fixed,
-        end.x_fixed - start.x_fixed,
-        sign,
-        image,
-    )
-    inverse_w = 1 / corners.w
-    x, y = list(corners.x * inverse_w), list(corners.y * inverse_w)
-    keys = list(corners.rank * inverse_w)
-    dx, dy = triangle_slopes(x, y, keys)
-    key = Plane(keys[0], dx, dy, x[0] - (1 - image.width) / 2, y[0] - (1 - image.height) / 2)
-    return Sweep(
-        edges,
-        Plane(*(column[None] for column in key)),
-        (minimum3(keys), maximum3(keys)),
-        pixel_range(minimum3(x_fixed), maximum3(x_fixed), size=image.width, bits=image.bits),
-        pixel_range(minimum3(y_fixed), maximum3(y_fixed), size=image.height, bits=image.bits),
-    )
-
-
-def set_up_wide(corners: Vertices, image: Image, *, cull_backfaces: bool) -> Sweep:
-    """Any vertices: edges as lines of homogeneous coordinates, near and far per pixel.
+def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
+    """Faces with any vertices: edges as lines of homogeneous coordinates, near and far per pixel.
 
     e_i(p) = p · (v_j × v_k) is proportional to the barycentric coordinate i times 1/w, and an
     attribute u with corner values u_i has u / w = Σ e_i(p) u_i / det on the face (Olano and Greer,
@@ -157,7 +132,9 @@ def set_up_wide(corners: Vertices, image: Image, *, cull_backfaces: bool) -> Swe
     # Numerators Σ e_i u_i of the key and of the distances from the near and the far plane.
     depths = corners.z * inverse_scale
     values = jnp.stack([corners.rank, points[2] + depths, points[2] - depths], axis=1)
-    factors = jnp.stack([inverse_size, orientation, orientation])
+    crossing = jnp.any((corners.outcode & (NEAR | FAR)) != 0, axis=0)
+    limit = jnp.where(crossing, orientation, 0)
+    factors = jnp.stack([inverse_size, limit, limit])
     value_0, value_1, value_2 = values
     dx, dy, value = (
         (value_0 * cross[0] + (value_1 - value_0) * cross[1] + (value_2 - value_0) * cross[2])
@@ -172,8 +149,17 @@ def set_up_wide(corners: Vertices, image: Image, *, cull_backfaces: bool) -> Swe
     infinite = jnp.asarray(jnp.inf, scale.dtype)
     # y points down: a front face, counter-clockwise to the viewer, has a negative determinant.
     # With a sign of zero the edges leave nothing inside.
-    drawn = (orientation < 0) if cull_backfaces else (orientation != 0)
-    sign = jnp.where(drawn, orientation, 0).astype(jnp.int32)
+    regular = jnp.all((corners.outcode & IRREGULAR) == 0, axis=0)
+    x_fixed, y_fixed = list(corners.x_fixed), list(corners.y_fixed)
+    turn = jnp.where(regular, twice_area_sign(x_fixed, y_fixed), orientation.astype(jnp.int32))
+    drawn = (turn < 0) if cull_backfaces else (turn != 0)
+    sign = jnp.where(drawn, turn, 0)
+
+    def extent(fixed: list[Array], size: int) -> tuple[Array, Array]:
+        first, last = pixel_range(minimum3(fixed), maximum3(fixed), size=size, bits=image.bits)
+        last = jnp.where(regular, last, size - 1)
+        return jnp.where(regular, first, 0), jnp.where(drawn, last, -1)
+
     return Sweep(
         _homogeneous_edge(*_edge_ends(corners), sign, image),
         Plane(value, dx, dy, centre_x, centre_y),
@@ -181,13 +167,13 @@ def set_up_wide(corners: Vertices, image: Image, *, cull_backfaces: bool) -> Swe
             jnp.where(bounded, minimum3(ratios), -infinite),
             jnp.where(bounded, maximum3(ratios), infinite),
         ),
-        (jnp.zeros_like(sign), jnp.full_like(sign, image.width - 1)),
-        (jnp.zeros_like(sign), jnp.where(drawn, image.height - 1, 0)),
+        extent(x_fixed, image.width),
+        extent(y_fixed, image.height),
     )
 
 
 def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image) -> Edge:
-    """Integer edge of a wide face; it depends on its two end points alone.
+    """Integer edge of a face; it depends on its two end points alone.
 
     Between regular ends the edge is that of every other face. With one regular end it passes
     exactly through the snapped end, so that a fan round a vertex in view has no gaps, towards the

@@ -8,8 +8,8 @@ bit for bit.
 
 A vertex is *regular* if it lies in front of the eye and inside the guard band of `2**22` grid steps
 round the image centre. Faces of regular vertices between the near and the far plane take the
-integer path, by size; all others (a vertex behind the eye, far off the screen, or beyond the near
-or far plane) are *wide* and keep homogeneous coordinates.
+path by blocks of pixels, if they are small; the class of all others keeps homogeneous coordinates,
+and has room for vertices behind the eye, far off the screen and beyond the near or far plane.
 """
 
 from typing import NamedTuple
@@ -22,8 +22,8 @@ GUARD_BITS = 22  # |fixed-point coordinate| <= 2**22, so that differences fit 24
 # Pixel blocks (rows, columns) that hold a face of each block class whole.
 BLOCKS = ((4, 4), (16, 16), (24, 32))
 
-# Classes of faces, in drawing order: one a block size, then LARGE, WIDE, CULLED.
-LARGE, WIDE, CULLED = range(len(BLOCKS), len(BLOCKS) + 3)
+# Classes of faces, in drawing order: one a block size, then LARGE, CULLED.
+LARGE, CULLED = range(len(BLOCKS), len(BLOCKS) + 2)
 
 
 def subpixel_bits(height: int, width: int) -> int:
@@ -46,7 +46,7 @@ class Vertices(NamedTuple):
 
 
 # Outcode bits. A face with one of the first seven bits common to its corners cannot be seen.
-_LEFT, _RIGHT, _BOTTOM, _TOP, _NEAR, _FAR, _BAD, IRREGULAR = (1 << i for i in range(8))
+_LEFT, _RIGHT, _BOTTOM, _TOP, NEAR, FAR, _BAD, IRREGULAR = (1 << i for i in range(8))
 
 
 def snap_vertices(positions_clip: Float[Array, "V 4"], *, height: int, width: int) -> Vertices:
@@ -77,8 +77,8 @@ def snap_vertices(positions_clip: Float[Array, "V 4"], *, height: int, width: in
             (x_clip > w, _RIGHT),
             (y_clip < -w, _BOTTOM),
             (y_clip > w, _TOP),
-            (z < -w, _NEAR),
-            (z > w, _FAR),
+            (z < -w, NEAR),
+            (z > w, FAR),
             (~finite, _BAD),
             (~regular, IRREGULAR),
         )
@@ -119,7 +119,7 @@ def twice_area_sign(x: list[Array], y: list[Array]) -> Array:
 def classify_faces(
     vertices: Vertices, faces: Int[Array, "F 3"], *, height: int, width: int, cull_backfaces: bool
 ) -> Int[Array, " F"]:
-    """Class of each face: the first of `BLOCKS` that holds it, LARGE, WIDE or CULLED."""
+    """Class of each face: the first of `BLOCKS` that holds it, LARGE or CULLED."""
     bits = subpixel_bits(height, width)
     corners = [faces[:, i] for i in range(3)]
     x = [vertices.x_fixed[c] for c in corners]
@@ -144,9 +144,9 @@ def classify_faces(
     for index, block in reversed(list(enumerate(BLOCKS))):
         size = jnp.where(compact & (rows <= block[0]) & (columns <= block[1]), index, size)
     size = jnp.where((columns <= 0) | (rows <= 0) | wrong_side, CULLED, size)
-    wide = (union & (IRREGULAR | _NEAR | _FAR)) != 0
+    size = jnp.where((union & (IRREGULAR | NEAR | FAR)) != 0, LARGE, size)
     unseen = ((common & (_BAD - 1)) != 0) | ((union & _BAD) != 0)
-    return jnp.where(unseen, CULLED, jnp.where(wide, WIDE, size))
+    return jnp.where(unseen, CULLED, size)
 
 
 def group_by_class(classes: Int[Array, " F"]) -> tuple[Int[Array, " F"], Int[Array, " starts"]]:
