@@ -12,6 +12,7 @@ product is taken of edges divided by the face's size s, and enters the sum with 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -279,15 +280,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     Raises:
         ValueError: for an empty list, or where some meshes have normals (or uvs) and some not.
     """
-    if len(meshes) == 0:
-        raise ValueError("meshes: wanted at least one mesh, got none")
-    for name in ("normals", "uvs"):
-        missing = [k for k, mesh in enumerate(meshes) if getattr(mesh, name) is None]
-        if 0 < len(missing) < len(meshes):
-            raise ValueError(
-                f"meshes: wanted {name} on all or none of {len(meshes)}, got none on number"
-                f" {missing[0]}"
-            )
+    _check_alike(meshes)
     offsets = np.cumsum([0, *(mesh.vertices.shape[0] for mesh in meshes)])
     uv_faces = None
     if any(mesh.uv_faces is not None for mesh in meshes):
@@ -303,6 +296,51 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
         uvs=_joined([mesh.uvs for mesh in meshes]),
         uv_faces=uv_faces,
     )
+
+
+def stack_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh with a leading axis, of meshes of any sizes: for `jax.vmap` and `dr.views`.
+
+    All get as many vertices and faces as the largest has. What is added is never seen: faces whose
+    corners are one vertex, which belong to no edge.
+
+    Args:
+        meshes: whose arrays are known, not traced. Texture coordinates and normals on all or none.
+
+    Returns:
+        A mesh whose arrays all have a leading axis, as `jax.vmap` takes and gives it. Not
+        differentiable here: change the positions of the result.
+
+    Raises:
+        ValueError: for an empty list, where some meshes have normals (or uvs) and some not, and
+            for traced arrays.
+    """
+    _check_alike(meshes)
+    for mesh in meshes:
+        _host_arrays(mesh.vertices, mesh.faces)
+    own_uvs = any(mesh.uv_faces is not None for mesh in meshes)
+    parts = any(mesh.topology is None or mesh.topology.bodies is not None for mesh in meshes)
+    alike = []
+    for mesh in meshes:
+        topology = mesh.topology or _topology_of(mesh.vertices, mesh.faces)
+        assert topology is not None
+        if parts and topology.bodies is None:
+            topology = topology._replace(bodies=jnp.zeros_like(topology.patches))
+        uv_faces = _uv_faces(mesh) if own_uvs else None
+        alike.append(replace(mesh, topology=topology, uv_faces=uv_faces))
+
+    def stacked(path: tuple[jax.tree_util.GetAttrKey, ...], *arrays: Array) -> Array:
+        names = [key.name for key in path]
+        no_face = names in (["topology", "edges", "faces"], ["topology", "neighbors"])
+        size = max(array.shape[0] for array in arrays)
+        rows = []
+        for array in arrays:
+            last = array[-1:] if jnp.issubdtype(array.dtype, jnp.floating) else -int(no_face)
+            more = jnp.broadcast_to(last, (size - array.shape[0], *array.shape[1:]))
+            rows.append(jnp.concatenate([array, more.astype(array.dtype)]))
+        return jnp.stack(rows)
+
+    return jax.tree_util.tree_map_with_path(stacked, *alike)
 
 
 def transform(mesh: Mesh, matrix: ArrayInput) -> Mesh:
@@ -407,6 +445,18 @@ def _topology_of(vertices: Array, faces: Array) -> Topology | None:
         return None
     topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces))
     return jax.tree.map(jnp.asarray, topology)
+
+
+def _check_alike(meshes: Sequence[Mesh]) -> None:
+    if len(meshes) == 0:
+        raise ValueError("meshes: wanted at least one mesh, got none")
+    for name in ("normals", "uvs"):
+        missing = [k for k, mesh in enumerate(meshes) if getattr(mesh, name) is None]
+        if 0 < len(missing) < len(meshes):
+            raise ValueError(
+                f"meshes: wanted {name} on all or none of {len(meshes)}, got none on number"
+                f" {missing[0]}"
+            )
 
 
 def _host_arrays(vertices: Array, faces: Array) -> tuple[np.ndarray, np.ndarray]:

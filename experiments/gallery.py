@@ -3,12 +3,12 @@
     python experiments/gallery.py
     python experiments/gallery.py --only fig_02 fig_20 --size 480
 
-Draws the figures of the course notes (A), the lectures (B), the thesis (C) and the paper (D) that
-need no textures, with captions: one PNG each, a contact sheet, a page `index.html`, and the star
-field as a GIF. Expected: pictures as the sources describe them, in less than ten minutes on two
-cores, most of which is compilation. Where a text copy of a source lacks a figure's data (rules of
-L-systems, scenes), classical ones of the same kind stand in; the captions say which. The sources'
-own scene file is drawn by `python -m diffrast render`.
+Draws the figures of the course notes (A), the lectures (B), the thesis (C) and the paper (D), with
+captions: one PNG each, a contact sheet, a page `index.html`, and the star field as a GIF. Expected:
+pictures as the sources describe them, in less than ten minutes on two cores, most of which is
+compilation. Where a text copy of a source lacks a figure's data (rules of L-systems, scenes,
+photographs as textures), classical ones of the same kind stand in; the captions say which. The
+sources' own scene file is drawn by `python -m diffrast render`.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import gallery_drawings
 import gallery_scenes
+import gallery_textures
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -40,7 +41,7 @@ class Picture(NamedTuple):
 
 def pictures() -> list[Picture]:
     """All figures, in the order of the sources."""
-    found = [*gallery_drawings.FIGURES, *gallery_scenes.FIGURES]
+    found = [*gallery_drawings.FIGURES, *gallery_scenes.FIGURES, *gallery_textures.FIGURES]
     return sorted((Picture(*figure) for figure in found), key=lambda picture: picture.name)
 
 
