@@ -64,13 +64,17 @@ class Problem:
         return dataclasses.replace(self, target=dr.fit.downsample(self.target, factor))
 
 
-def render_view(mesh: dr.Mesh, view: View, height: int, width: int, samples: int = 4) -> Array:
+def render_view(
+    mesh: dr.Mesh, view: View, height: int, width: int, samples: int = 4, antialias: bool = True
+) -> Array:
     """Render what a target picture holds: values clamped to 0 to 1, back faces culled."""
     scene = dr.Scene(
         objects=[dr.Object(mesh, view.material)], lights=view.lights, background=view.background
     )
     camera = dr.Camera.perspective(**view.camera, aspect=width / height)
-    settings = dr.RenderSettings(height=height, width=width, cull_backfaces=True, samples=samples)
+    settings = dr.RenderSettings(
+        height=height, width=width, cull_backfaces=True, samples=samples, antialias=antialias
+    )
     return jnp.clip(dr.render(scene, camera, settings), 0, 1)
 
 

@@ -48,6 +48,7 @@ CAMERA = dr.Camera.perspective(
 )
 BALL = dr.shapes.icosphere(4, 0.5)
 FLOOR = dr.Object(dr.shapes.plane(4.0, 3.0), None, dr.linalg.rotation_x(-np.pi / 2))
+EXACT = 100.0  # moved so many times its size by noise, a combination has no effect at all
 NOISE = 1 / 255
 
 Params = dict[str, Any]
@@ -138,21 +139,42 @@ def identifiability(params: Params, size: int) -> tuple[np.ndarray, list[dict[st
     """Singular values of the derivative, and the combinations of parameters that stay unknown.
 
     Parameters are taken relative to their size, so that a change of one is one of 100 %. Noise of
-    1/255 a pixel moves a combination by that over its singular value.
+    1/255 a pixel moves a combination by that over its singular value; those that it moves without
+    bound come first.
     """
     scale = np.maximum(np.abs(np.asarray(ravel_pytree(params)[0], float)), 0.1)
     derivative = np.asarray(jacobian(params, size), float) * scale
     _, values, rows = np.linalg.svd(derivative, full_matrices=False)
-    names = names_of(params)
-    unknown = []
-    for value, row in zip(values[::-1], rows[::-1], strict=True):
-        moved = NOISE / max(value, 1e-12)
-        if moved < 0.1:
+    names, unknown = names_of(params), []
+    moved = NOISE / np.maximum(values, 1e-12)
+    exact = moved > EXACT
+    for distance, row in zip(
+        [*moved[exact], *moved[~exact][::-1]],
+        [*fewest_parts(rows[exact]), *rows[~exact][::-1]],
+        strict=True,
+    ):
+        if distance < 0.1:
             break
         most = np.argsort(-np.abs(row))[:8]
         taking_part = {names[i]: float(row[i]) for i in most if abs(row[i]) > 0.05}
-        unknown.append({"moved_by_noise": float(moved), "parameters": taking_part})
+        unknown.append({"moved_by_noise": float(distance), "parameters": taking_part})
     return values, unknown
+
+
+def fewest_parts(rows: np.ndarray) -> np.ndarray:
+    """Unit vectors that span the same space, each with an entry that the others lack.
+
+    Any mixture of what cannot be known at all is as unknown: this one can be read.
+    """
+    rows = rows.copy()
+    for k in range(len(rows)):
+        free = np.abs(rows[k:])
+        pivot_row, pivot = np.unravel_index(np.argmax(free), free.shape)
+        rows[[k, k + pivot_row]] = rows[[k + pivot_row, k]]
+        rows[k] /= rows[k, pivot]
+        others = np.arange(len(rows)) != k
+        rows[others] -= rows[others, pivot, None] * rows[k]
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
 def with_scale_fixed(params: Params, truth: Params) -> Params:

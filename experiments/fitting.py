@@ -81,18 +81,20 @@ def coarse_to_fine(height: int, width: int) -> list[Level]:
 
 
 @functools.cache
-def residual_function(height: int, width: int, samples: int, radius: int) -> Any:
+def residual_function(
+    height: int, width: int, samples: int, radius: int, antialias: bool = True
+) -> Any:
     """Residuals of a level, always the same function for the same numbers: it compiles once.
 
     Called as `residuals(params, start, target, blur, moving)`; where `moving` is 0 and not 1, the
-    camera's parameter has no derivative.
+    camera's parameter has no derivative. Of lights and materials alone edges say nothing.
     """
 
     def residuals(params: Params, start: Start, target: Array, blur: Array, moving: Array) -> Array:
         camera = params.get("camera", jnp.zeros(CAMERA_PARAMETERS))
         camera = jnp.where(moving > 0, camera, jax.lax.stop_gradient(camera))
         view = View(moved_camera(start, camera), *appearance_of(start, params), start.background)
-        image = render_view(start.mesh, view, height, width, samples)
+        image = render_view(start.mesh, view, height, width, samples, antialias)
         return dr.fit.gaussian_blur(image - target, blur, radius=radius)
 
     return residuals
@@ -194,7 +196,7 @@ def fit_level(
     height, width = small.shape[:2]
     radius = RADIUS if level.blur > 0 else 0
     return dr.fit.least_squares(
-        residual_function(height, width, level.samples, radius),
+        residual_function(height, width, level.samples, radius, "camera" in params),
         params,
         args=(start, small, jnp.float32(level.blur), moving(level)),
         steps=level.steps,

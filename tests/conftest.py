@@ -25,6 +25,15 @@ def forget_programs():
         jax.clear_caches()
 
 
+@pytest.fixture(scope="module")
+def compiled_quickly():
+    """For modules of few and large programs: compiled in two thirds of the time, and slower."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
+
+
 @pytest.fixture
 def unchecked(monkeypatch):
     """The library's own errors, not those of the annotations that the tests check."""

@@ -10,6 +10,8 @@ import diffrast as dr
 from diffrast import _commands
 from diffrast.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 DATA = Path(__file__).parent / "data"
 SMALL = ["--size", "24", "--no-antialias"]
 

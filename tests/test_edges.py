@@ -13,6 +13,8 @@ from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.blend import Method, View, collect
 from diffrast.edges.derivative import apply_linear
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 SETTINGS = dr.RenderSettings(height=20, width=24, antialias=True)
 LIGHTS = [dr.DirectionalLight(direction=(-0.4, -0.5, -1.0))]
 MESH = dr.shapes.torus(1.0, 0.4, major_segments=9, minor_segments=6)

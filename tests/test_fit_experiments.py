@@ -13,6 +13,8 @@ import pytest
 
 import diffrast as dr
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def test_a_sphere_becomes_the_body(tmp_path):
     report = fit_shape.run(tmp_path, size=32, views=5, subdivisions=2, steps=60, smoothness=3.0)

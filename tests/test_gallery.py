@@ -9,6 +9,8 @@ from gallery_scenes import head, trunk
 import diffrast as dr
 from diffrast import mesh as dm
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def test_pictures_sheet_and_page_are_written(tmp_path):
     names = ["A_fig_04", "D_stars"]

@@ -16,6 +16,8 @@ import pytest
 
 import diffrast as dr
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 KINDS = {
     "ambient": dr.AmbientLight,
     "directional": dr.DirectionalLight,
@@ -206,24 +208,26 @@ def test_derivatives_by_vertices():
     assert np.linalg.norm(ours - truth) < 0.07 * np.linalg.norm(truth)
 
 
-def test_parallel_projection_has_the_same_edges():
-    problem = replace(reference.piercing(), window=3.0)
-    shift, step = np.array([0.3, -0.2, 0.5]), 1e-2
+@pytest.mark.parametrize(
+    ("name", "window", "way"),
+    [("piercing", 3.0, {"object translation": (0.3, -0.2, 0.5)}),
+     ("shadow_sun", 3.4, {"light direction": (0.3, 0.2, -0.4)})],
+)  # fmt: skip
+def test_parallel_projection_has_the_same_edges(name, window, way):
+    problem = replace(reference.SCENES[name](), window=window)
+    ((group, change),) = way.items()
+    part, step = reference.groups(problem)[group], 1e-2
 
     def truth(steps):
-        params = np.append(np.zeros(10), steps * step * shift)
+        params = np.zeros(reference.parameters(problem))
+        params[part] = steps * step * np.array(change)
         return reference.reference_image(problem, params)
 
-    fields = reference.adjoint_fields(problem.size)
-    ours, got, _ = derivatives(
-        scene_of(problem, "piercing"),
-        jnp.zeros(13),
-        settings_of(problem),
-        np.float32(fields),
-        truth(0),
-    )
-    assert np.abs(ours - truth(0)).mean() < 1e-4
-    got = got[:, 10:] @ shift
+    fields, still = reference.adjoint_fields(problem.size), truth(0)
+    start, settings = jnp.zeros(reference.parameters(problem)), settings_of(problem)
+    results = derivatives(scene_of(problem, name), start, settings, np.float32(fields), still)
+    assert np.abs(results[0] - still).mean() < 1e-4
+    got = results[1][:, part] @ np.array(change)
     want = np.einsum("fhwc,hwc->f", fields, (truth(1) - truth(-1)) / (2 * step))
     assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
 

@@ -17,6 +17,8 @@ from diffrast.files.scenes import (
     save_scene_file,
 )
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 DATA = Path(__file__).parent / "data"
 
 

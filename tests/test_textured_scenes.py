@@ -12,6 +12,8 @@ from test_render import operations, times
 import diffrast as dr
 from diffrast import shapes
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 SIZE = 16
 RNG = np.random.default_rng(0)
 IMAGE = RNG.uniform(size=(16, 16, 3)).astype(np.float32)
