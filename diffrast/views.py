@@ -5,7 +5,7 @@ one on each core of the CPU, or on each of the devices given. A view is drawn by
 whatever its place among the others, so the result has the same bits for any size of chunks and any
 number of cores or devices; sums are taken in blocks of fixed size for the same reason. A view is
 not only a camera: any tree of arrays with a common leading axis may differ from view to view,
-lights, transforms, materials or meshes of equal size.
+lights, transforms, materials or meshes (`dr.mesh.stack_meshes` makes them equally large).
 
 Inside of `jax.jit`, `jax.grad` and other transformations, where numbers are not known, the views
 are mapped by `jax.lax.map`, and the derivative draws each view again instead of keeping what it

@@ -64,6 +64,31 @@ def test_anything_may_differ_from_view_to_view():
         np.testing.assert_array_equal(got[i], lit_from(objects, (directions[i], TURNS[i])))
 
 
+def show(turn, mesh):
+    return dr.render(dr.Scene(objects=[dr.Object(mesh)]), camera(turn), SETTINGS)
+
+
+def test_meshes_of_unequal_sizes_are_padded():
+    cube = shapes.cube()
+    two = dr.mesh.merge([MESH, dr.mesh.transform(cube, dr.linalg.translation((1.1, 0.9, 0.2)))])
+    meshes = [MESH, cube, two]
+    stack = dr.mesh.stack_meshes(meshes)
+    got = views.map_views(show, stack, TURNS[1])
+    for image, mesh in zip(got, meshes, strict=True):
+        np.testing.assert_array_equal(image, show(TURNS[1], mesh))
+    # One body and two, edges that no face has and faces that have no edges.
+    edges, bodies = stack.topology.edges, stack.topology.bodies
+    numbers = [np.unique(n[: len(m.faces)]) for n, m in zip(bodies, meshes, strict=True)]
+    assert [len(n) for n in numbers] == [1, 1, 2]
+    used = [np.asarray(row)[:, 0] >= 0 for row in edges.faces]
+    assert [row.sum() for row in used] == [120, 18, 138]
+    assert np.all(stack.topology.neighbors[1, len(cube.faces) :] == -1)
+    with pytest.raises(ValueError, match="meshes: wanted normals on all or none of 2"):
+        dr.mesh.stack_meshes([MESH, dr.Mesh(vertices=cube.vertices, faces=cube.faces)])
+    with pytest.raises(ValueError, match="wanted known vertices and faces"):
+        jax.jit(lambda x: dr.mesh.stack_meshes([dr.mesh.transform(MESH, x)]))(jnp.eye(4))
+
+
 def wave(frequency, place):
     return jnp.sin(frequency * place + jnp.arange(7.0))
 
