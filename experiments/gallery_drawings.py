@@ -212,6 +212,53 @@ def spheres(size: int) -> Array:
     return side_by_side([wire(dr.shapes.icosphere(n), size // 2) for n in (1, 2, 3)])
 
 
+def subdivision(size: int) -> Array:
+    """The triangle ABC becomes ADE, BFD, CEF and DFE; D, E and F lie half-way."""
+    corners = np.array([[-1.0, 0], [1, 0], [0, np.sqrt(3)]])
+    middles = (corners + np.roll(corners, -1, axis=0)) / 2
+    lines = [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)]
+    colors = np.array([INK] * 3 + [FOUR_COLORS[2]] * 3)
+    return drawn(np.concatenate([corners, middles]), lines, colors, size, line_width=2.0)
+
+
+def arrows(begin: Any, end: Any, across: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Points and lines of arrows, whose heads lie in the plane of `across`."""
+    begin, end, across = (np.asarray(x, float) for x in (begin, end, across))
+    back = end + 0.15 * (begin - end)
+    points = np.stack([begin, end, back + 0.07 * across, back - 0.07 * across], axis=1)
+    first = 4 * np.arange(len(points))[:, None, None]
+    lines = first + np.array([[0, 1], [1, 2], [1, 3]])
+    return points.reshape(-1, points.shape[-1]), lines.reshape(-1, 2)
+
+
+def turtle(size: int) -> Array:
+    """Heading H (red), left L (green) and up U (blue), of a turtle that is a tetrahedron."""
+    axes = np.eye(3)
+    points, lines = arrows(np.zeros((3, 3)), axes, np.roll(axes, 1, axis=0))
+    body = 0.3 * np.array([[1.6, 0, 0], [-0.8, 0.8, 0], [-0.8, -0.8, 0], [-0.4, 0, 0.7]])
+    edges = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
+    colors = np.concatenate([np.repeat(FOUR_COLORS[:3], 3, axis=0), [INK] * 6])
+    together = np.concatenate([lines, np.array(edges) + len(points)])
+    view = {"theta": 0.5, "phi": 1.1, "line_width": 1.5}
+    return space_drawing(np.concatenate([points, body]), together, colors, size, **view)
+
+
+def reflection(size: int) -> Array:
+    """Normal n (blue), light l (yellow) and r = 2 (n . l) n - l (red), and how r is made."""
+    normal, light = np.array([0.0, 1]), np.array([-np.sin(0.8), np.cos(0.8)])
+    cosine = normal @ light
+    mirrored = 2 * cosine * normal - light
+    ends = np.stack([light, normal, mirrored])
+    across = np.stack([ends[:, 1], -ends[:, 0]], axis=1)
+    points, lines = arrows(np.zeros((3, 2)), ends, across)
+    more = np.array([[-1.0, 0], [1, 0], 2 * cosine * normal, light, mirrored, normal])
+    extra = np.array([(0, 1), (3, 2), (2, 4), (5, 2)]) + len(points)
+    grey = (0.6, 0.6, 0.6)
+    colors = np.concatenate([np.repeat(FOUR_COLORS[[3, 2, 0]], 3, axis=0), [INK, *[grey] * 3]])
+    together = np.concatenate([lines, extra])
+    return drawn(np.concatenate([points, more]), together, colors, size, line_width=2.0)
+
+
 def cube_fractal(size: int) -> Array:
     cube = dr.shapes.cube(flat=False)
     images = []
@@ -376,7 +423,9 @@ FIGURES = [
     ("A_fig_08", "Plants by L-systems with brackets (classical rules)", plants),
     ("A_fig_14", "Wireframe of the teapot, transparent", teapot_wire),
     ("A_fig_15_16", "Wireframes of the Platonic solids and the buckyball", platonic),
+    ("A_fig_17", "A triangle of the icosahedron becomes four", subdivision),
     ("A_fig_18", "Wireframes of spheres from the icosahedron", spheres),
+    ("A_fig_19", "Heading, left and up of the turtle", turtle),
     ("A_fig_20", "Hilbert curve in space; cube with a system on each face", hilbert_and_cube),
     ("A_fig_21", "A plant in space, n = 3 and 4", plant_in_space),
     (
@@ -385,6 +434,7 @@ FIGURES = [
         lambda size: hilbert_and_cube(size, colored=True),
     ),
     ("A_fig_33", "Fractal of the cube, scale 3, 0 to 3 steps", cube_fractal),
+    ("A_fig_42", "The direction r in which light is mirrored", reflection),
     ("B_lines", "Midpoint algorithm, and the box filter", raster_lines),
     ("B_triangle", "A triangle with interpolated colours", raster_triangle),
     ("C_fig_23", "Wireframe with hidden faces removed", teapot_hidden),
