@@ -213,7 +213,8 @@ def test_a_light_that_is_not_seen_leaves_its_ambient_part():
 
 
 def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
-    size = 48
+    """Picture and derivative by the light against many samples."""
+    size, step = 48, 0.01
     turned = linalg.compose(linalg.translation((0, -0.2, 0)), linalg.rotation_y(0.5))
     box = dr.Object(shapes.cube(), transform=turned @ linalg.scaling(0.5))
     tiles = floor(shapes.plane(8.0, 8.0, divisions=5))
@@ -221,13 +222,23 @@ def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
         eye=(3, 3, 6), target=(0, -0.3, 0), up=(0, 1, 0), height=4.0, near=0.1, far=50.0
     )
 
-    def picture(**options):
-        scene = dr.Scene(objects=[box, tiles], lights=[sun((-0.65, -1, -0.15))])
+    def picture(direction, **options):
+        scene = dr.Scene(objects=[box, tiles], lights=[sun(direction)])
         options = dr.RenderSettings(height=size, width=size, shading="flat", **options)
         return dr.render(scene, camera, options)
 
-    got, want = picture(), picture(antialias=False, samples=256)
+    def many_samples(direction):
+        return np.asarray(picture(direction, antialias=False, samples=256), float)
+
+    light, way = jnp.array([-0.65, -1, -0.15]), jnp.array([0.6, 0.2, -0.7])
+    got, change = jax.jit(lambda d, v: jax.jvp(picture, (d,), (v,)))(light, way)
+    want = many_samples(light)
     assert np.mean(np.abs(got - want)) < 2.5e-4  # without edges .005
+    difference = (many_samples(light + step * way) - many_samples(light - step * way)) / (2 * step)
+    blurred = [
+        x.reshape(12, 4, 12, 4, 3).mean(axis=(1, 3)) for x in (np.asarray(change), difference)
+    ]
+    assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
 
 
 def test_pairs_of_pixels_without_an_outline_are_counted():

@@ -119,13 +119,18 @@ def test_gradient_through_the_views(singles):
 MANY_DEVICES = """
 import jax, numpy as np
 jax.config.update("jax_num_cpu_devices", 4)
+import diffrast as dr
 import test_views as t
 from diffrast import views
 
-sums = []
+images, sums = [], []
+for devices in (None, jax.devices()[:3]):
+    images.append(dr.render_views(t.scene(), t.CAMERAS, t.SETTINGS, devices=devices))
 for devices in (None, jax.devices()[:1], jax.devices()[:2], jax.devices()):
     many = np.linspace(0, 1, 41, dtype=np.float32)
     sums.append(views.sum_views(t.wave, many, np.float32(3), devices=devices))
+for other in images[1:]:
+    np.testing.assert_array_equal(other, images[0])
 for other in sums[1:]:
     np.testing.assert_array_equal(other, sums[0])
 """
