@@ -319,15 +319,13 @@ def stack_meshes(meshes: Sequence[Mesh]) -> Mesh:
     for mesh in meshes:
         _host_arrays(mesh.vertices, mesh.faces)
     own_uvs = any(mesh.uv_faces is not None for mesh in meshes)
-    parts = any(mesh.topology is None or mesh.topology.bodies is not None for mesh in meshes)
-    alike = []
-    for mesh in meshes:
-        topology = mesh.topology or _topology_of(mesh.vertices, mesh.faces)
-        assert topology is not None
-        if parts and topology.bodies is None:
-            topology = topology._replace(bodies=jnp.zeros_like(topology.patches))
-        uv_faces = _uv_faces(mesh) if own_uvs else None
-        alike.append(replace(mesh, topology=topology, uv_faces=uv_faces))
+    alike = [replace(mesh, uv_faces=_uv_faces(mesh) if own_uvs else None) for mesh in meshes]
+    topologies = [mesh.topology for mesh in alike if mesh.topology is not None]  # all of them
+    if any(topology.bodies is not None for topology in topologies):
+        alike = [
+            replace(mesh, topology=_with_bodies(topology))
+            for mesh, topology in zip(alike, topologies, strict=True)
+        ]
 
     def stacked(path: tuple[jax.tree_util.GetAttrKey, ...], *arrays: Array) -> Array:
         names = [key.name for key in path]
@@ -445,6 +443,13 @@ def _topology_of(vertices: Array, faces: Array) -> Topology | None:
         return None
     topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces))
     return jax.tree.map(jnp.asarray, topology)
+
+
+def _with_bodies(topology: Topology) -> Topology:
+    """The same with a number for the body of each face, even if all are of one."""
+    if topology.bodies is not None:
+        return topology
+    return topology._replace(bodies=jnp.zeros_like(topology.patches))
 
 
 def _check_alike(meshes: Sequence[Mesh]) -> None:

@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, random_start_options, save_json, show_fit, statistics
+from common import exact_settings, pyplot, random_start_options, save_json, show_fit, statistics
 from fitting import Patience
 from jax import Array
 
@@ -143,8 +143,7 @@ def run(
 ) -> dict[str, Any]:
     """Fit from random starts; see the module's docstring for the result."""
     began = time.perf_counter()
-    # What is to be found is not drawn by the method on trial.
-    exact = dr.RenderSettings(height=size, width=size, samples=256, antialias=False)
+    exact = exact_settings(size)
     settings = dr.RenderSettings(height=size, width=size)
     generator = np.random.default_rng(seed)
     report: dict[str, Any] = {"criterion": CRITERION, "size": size, "seed": seed, "lights": {}}

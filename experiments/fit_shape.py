@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from common import pyplot, save_json
+from common import exact_settings, pyplot, save_json
 from jax import Array
 
 import diffrast as dr
@@ -170,8 +170,7 @@ def run(
 ) -> dict[str, Any]:
     """Fit the sphere; see the module's docstring for the result."""
     cameras = cameras_around(views)
-    # What is to be found is not drawn by the method on trial.
-    exact = dr.RenderSettings(height=size, width=size, samples=256, antialias=False)
+    exact = exact_settings(size)
     targets = pictures(body(5), cameras, exact)
     sphere = dataclasses.replace(dr.shapes.icosphere(subdivisions, START_RADIUS), normals=None)
     meshes, fits = {"start": sphere}, {}

@@ -1,7 +1,7 @@
 """Do the pictures of the sources come out?
 
     python experiments/gallery.py
-    python experiments/gallery.py --only fig_02 fig_20 --size 480
+    python experiments/gallery.py --only A_fig_02 A_fig_20 --size 480
 
 Draws the figures of the course notes (A), the lectures (B), the thesis (C) and the paper (D), with
 captions: one PNG each, a contact sheet, a page `index.html`, and the star field as a GIF. Expected:

@@ -60,9 +60,15 @@ def teapot(material: dr.Material | None = None, divisions: int = 10) -> dr.Objec
     return dr.Object(dr.shapes.teapot(divisions), material or dr.Material(diffuse=WHITE))
 
 
+def placed(
+    mesh: dr.Mesh, material: dr.Material, place: Sequence[float], scale: Sequence[float] = (1, 1, 1)
+) -> dr.Object:
+    placing = dr.linalg.compose(dr.linalg.translation(place), dr.linalg.scaling(scale))
+    return dr.Object(mesh, material, placing)
+
+
 def at(mesh: dr.Mesh, color: Sequence[float], x: float, y: float, z: float, s: float = 1.0) -> Any:
-    placing = dr.linalg.compose(dr.linalg.translation((x, y, z)), dr.linalg.scaling((s, s, s)))
-    return dr.Object(mesh, dr.Material(diffuse=color), placing)
+    return placed(mesh, dr.Material(diffuse=color), (x, y, z), (s, s, s))
 
 
 def solids() -> list[dr.Object]:

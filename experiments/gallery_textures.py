@@ -1,14 +1,12 @@
 """The sources' textured pictures; the images on the surfaces are made by formulas."""
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gallery_drawings import side_by_side
-from gallery_scenes import shaded, sun
+from gallery_scenes import placed, shaded, sun, teapot
 from jax import Array
 
 import diffrast as dr
@@ -22,7 +20,7 @@ SIDES = (
     ((0, 0, 1), (0, 1, 0)),
     ((0, 0, -1), (0, 1, 0)),
 )
-Y_UP: dict[str, Any] = {"up": (0, 1, 0), "target": (0, 0, 0)}
+Y_UP: dict[str, Any] = {"up": (0, 1, 0)}
 
 
 def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -123,8 +121,8 @@ def material(image: np.ndarray, **options: Any) -> dr.Material:
     return dr.Material(diffuse=(1, 1, 1), texture=texture)
 
 
-def box(repeats: float = 1.0) -> dr.Mesh:
-    """A cube of edge 2 with the whole image, or several, on each side."""
+def box() -> dr.Mesh:
+    """A cube of edge 2 with the whole image on each side."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     vertices = [
         np.asarray(forward)
@@ -133,29 +131,24 @@ def box(repeats: float = 1.0) -> dr.Mesh:
         for forward, top in SIDES
     ]
     faces = np.concatenate([np.array([(0, 1, 2), (0, 2, 3)]) + 4 * side for side in range(6)])
-    uvs = np.tile((corners + 1) / 2 * repeats, (6, 1))
+    uvs = np.tile((corners + 1) / 2, (6, 1))
     return dr.Mesh(vertices=np.concatenate(vertices), faces=faces, uvs=uvs)
-
-
-def _placed(mesh: dr.Mesh, surface: dr.Material, place: Any, scale: Any = (1, 1, 1)) -> dr.Object:
-    matrix = dr.linalg.compose(dr.linalg.translation(place), dr.linalg.scaling(scale))
-    return dr.Object(mesh, surface, matrix)
 
 
 def desk(size: int) -> Array:
     """Left a desk; right a sponge with another image on each of three pairs of sides."""
     oak, paper = material(wood()), material(page())
     things = [
-        _placed(box(), oak, (0, 0, 2.0), (2.4, 1.3, 0.08)),
+        placed(box(), oak, (0, 0, 2.0), (2.4, 1.3, 0.08)),
         *(
-            _placed(box(), oak, (x, y, 0.96), (0.1, 0.1, 0.96))
+            placed(box(), oak, (x, y, 0.96), (0.1, 0.1, 0.96))
             for x in (-2.2, 2.2)
             for y in (-1.1, 1.1)
         ),
-        _placed(dr.shapes.plane(1.0, 1.4), paper, (-0.6, -0.2, 2.09)),
-        _placed(dr.shapes.plane(1.0, 1.4), paper, (0.8, 0.1, 2.09)),
-        _placed(box(), material(marble()), (1.7, 0.7, 2.3), (0.3, 0.3, 0.22)),
-        _placed(dr.shapes.plane(14.0, 14.0), material(tiles(count=12)), (0, 0, 0)),
+        placed(dr.shapes.plane(1.0, 1.4), paper, (-0.6, -0.2, 2.09)),
+        placed(dr.shapes.plane(1.0, 1.4), paper, (0.8, 0.1, 2.09)),
+        placed(box(), material(marble()), (1.7, 0.7, 2.3), (0.3, 0.3, 0.22)),
+        placed(dr.shapes.plane(14.0, 14.0), material(tiles(count=12)), (0, 0, 0)),
     ]
     seen = shaded(things, [sun(ambient=0.3)], size, eye=(3.6, -6.0, 4.6), target=(0, 0, 1.3))
     sponge = dr.shapes.menger_sponge(2)
@@ -191,7 +184,7 @@ def resolutions(size: int) -> Array:
 
 def textured_spheres(size: int) -> Array:
     """Each image on the half towards the viewer, and all of it round the ball."""
-    view = {**Y_UP, "eye": (0.4, 0.9, 4.0), "background": (0.03, 0.03, 0.06)}
+    view = {**Y_UP, "eye": (0.4, 0.9, 4.0), "target": (0, 0, 0), "background": (0.03, 0.03, 0.06)}
     light = [sun((0.5, -0.4, -0.8), ambient=0.1)]
     images = []
     for image, kind in (
@@ -206,12 +199,11 @@ def textured_spheres(size: int) -> Array:
 def projected_teapot(size: int) -> Array:
     """The image is stretched where the surface turns away from its plane."""
     mapping = dr.PlanarMapping(corner=(-3, 0, 0), across=(6, 0, 0), up=(0, 0, 6))
-    pot = dr.shapes.teapot(10)
     flowers = checks(16, (0.15, 0.3, 0.65), (0.93, 0.93, 0.9)) * 0.8 + 0.2 * marble()
     surface = material(flowers, mapping=mapping)
     views = ((1.0, -8.5, 3.5), (8.0, -3.0, 3.5))
     light = [sun((0.1, 0.8, -0.6), ambient=0.25)]
-    return side_by_side([shaded([dr.Object(pot, surface)], light, size, eye=eye) for eye in views])
+    return side_by_side([shaded([teapot(surface)], light, size, eye=eye) for eye in views])
 
 
 def mirrored_surroundings(size: int) -> Array:
@@ -225,14 +217,15 @@ def mirrored_surroundings(size: int) -> Array:
         (dr.shapes.torus(0.9, 0.4), turned),
         (dr.shapes.teapot(10), np.asarray(turned) @ np.diag([0.4, 0.4, 0.4, 1])),
     ):
-        body = dr.mesh.transform(mesh, matrix)
+        body = dr.mesh.transform(mesh, matrix)  # a texture stays with its mesh
         images.append(
             shaded(
-                [dr.Object(dataclasses.replace(body, uvs=None), surface)],
+                [dr.Object(body, surface)],
                 [dr.AmbientLight((1.0, 1.0, 1.0))],
                 size,
-                **{**Y_UP, "target": (0, 0.2, 0)},
+                **Y_UP,
                 eye=(1.5, 0.9, 2.9),
+                target=(0, 0.2, 0),
                 fov_y=0.9,
                 background=world,
             )
@@ -256,9 +249,9 @@ def texture_coordinates(size: int) -> Array:
         background=(0.75, 0.85, 1.0),
     )
     still = [
-        _placed(dr.shapes.uv_sphere(1.0, segments=48, rings=24), material(planet()), (-1.2, 0, 1)),
-        _placed(dr.shapes.cylinder(0.6, 1.8), material(wood()), (1.0, -0.6, 0.9)),
-        _placed(box(), material(marble()), (1.2, 1.4, 0.7), (0.7, 0.7, 0.7)),
+        placed(dr.shapes.uv_sphere(1.0, segments=48, rings=24), material(planet()), (-1.2, 0, 1)),
+        placed(dr.shapes.cylinder(0.6, 1.8), material(wood()), (1.0, -0.6, 0.9)),
+        placed(box(), material(marble()), (1.2, 1.4, 0.7), (0.7, 0.7, 0.7)),
         dr.Object(floor, material(checks(2, (0.2, 0.2, 0.25), (0.8, 0.8, 0.8)))),
     ]
     view = {"eye": (4.5, -5.5, 3.8), "target": (0, 0, 0.7)}
@@ -270,8 +263,7 @@ def texture_coordinates(size: int) -> Array:
     return side_by_side(images)
 
 
-Figure = tuple[str, str, Callable[[int], Array]]
-FIGURES: list[Figure] = [
+FIGURES = [
     ("A_fig_50", "A desk and a Menger sponge with several images", desk),
     ("A_fig_52", "An image of few texels, without and with interpolation", resolutions),
     ("A_fig_54", "Images on a ball: the half towards the viewer, all round", textured_spheres),

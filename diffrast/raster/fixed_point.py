@@ -7,9 +7,9 @@ rounding at all; both owners of an edge, and the joined and the corner-split for
 bit for bit.
 
 A vertex is *regular* if it lies in front of the eye and inside the guard band of `2**22` grid steps
-round the image centre. Faces of regular vertices between the near and the far plane take the
-path by blocks of pixels, if they are small; the class of all others keeps homogeneous coordinates,
-and has room for vertices behind the eye, far off the screen and beyond the near or far plane.
+round the image centre. Small faces of regular vertices between the near and the far plane are drawn
+by blocks of pixels; the class of all others keeps homogeneous coordinates, for vertices behind the
+eye, far off the screen and beyond the near or far plane.
 """
 
 from typing import NamedTuple
