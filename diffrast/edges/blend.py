@@ -23,16 +23,21 @@ from diffrast._selection import over_batches, prefix_sum
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.pieces import (
+    CUT_AT_ONCE,
     EDGES_AT_ONCE,
     PIECES_AT_ONCE,
     Pieces,
     Segments,
+    Waiting,
+    behind,
     choose_edges,
     clip_edges,
     cut,
     facing,
+    first_ones,
     gathered,
-    no_pieces,
+    instead_of_first,
+    none_waiting,
     to_pixels,
 )
 from diffrast.edges.piercing import (
@@ -45,7 +50,7 @@ from diffrast.edges.piercing import (
 )
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
-from diffrast.edges.visibility import BACKGROUND, Seen, look
+from diffrast.edges.visibility import BACKGROUND, Seen, look, uncovered
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 
@@ -158,12 +163,20 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         )
         ends = prefix_sum(segments.parts)
 
-        def add_pieces(state: tuple[Array, Pieces, Blended]) -> tuple[Array, Pieces, Blended]:
-            next_piece, left, total = state
-            waiting = jnp.sum(left.exists)
-            first_piece = next_piece - waiting
-            pieces = cut(segments, ends, first_piece, height=height, width=width)
-            pieces = jax.tree.map(lambda a, b: jnp.where(left.exists, a, b), left, pieces)
+        cuts = (ends[-1] + CUT_AT_ONCE - 1) // CUT_AT_ONCE
+
+        def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
+            n, waiting = state
+            pieces = cut(segments, ends, n * CUT_AT_ONCE, height=height, width=width)
+            pieces = uncovered(pieces, segments, view.faces, pixels, view.face_image)
+            return n + 1, behind(waiting, *gathered(pieces))
+
+        def are_few(state: tuple[Array, Waiting]) -> Array:
+            return (state[0] < cuts) & (state[1].total < PIECES_AT_ONCE)
+
+        def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
+            n, waiting = lax.while_loop(are_few, add_cut, state[:2])
+            pieces = first_ones(waiting)
             found, left = look(
                 pieces,
                 segments,
@@ -174,13 +187,13 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
                 view.face_image,
                 has_background,
             )
-            total = _with_pieces(total, view, method, segments, pieces, found, first)
-            return first_piece + PIECES_AT_ONCE, gathered(left), total
+            total = _with_pieces(state[2], view, method, segments, pieces, found, first)
+            return n, instead_of_first(waiting, left), total
 
-        def is_left(state: tuple[Array, Pieces, Blended]) -> Array:
-            return (state[0] < ends[-1]) | state[1].exists[0]
+        def is_left(state: tuple[Array, Waiting, Blended]) -> Array:
+            return (state[0] < cuts) | (state[1].total > 0)
 
-        start = ends[-1] & 0, no_pieces(segments), total
+        start = ends[-1] & 0, none_waiting(segments), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
     nothing = _nothing(view, method, edge_count & 0)

@@ -12,6 +12,7 @@ number one larger: so piece k of a line is found without walking along it, all a
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,7 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 
 EDGES_AT_ONCE = 512
+CUT_AT_ONCE = 1024
 PIECES_AT_ONCE = 512
 _EDGE_ON = 8  # roundings in the volume of a face
 
@@ -208,9 +210,9 @@ def cut(
     segments: Segments, ends: Int[Array, " n"], first_piece: Array, *, height: int, width: int
 ) -> Pieces:
     """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their counts."""
-    number = first_piece + jnp.arange(PIECES_AT_ONCE)
+    number = first_piece + jnp.arange(CUT_AT_ONCE)
     # As many segments end before or at each piece's number.
-    ended = jnp.zeros(PIECES_AT_ONCE, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
+    ended = jnp.zeros(CUT_AT_ONCE, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
     segment = prefix_sum(ended.add(1, mode="drop"))
     exists = segment < ends.shape[0]
     segment = stored(jnp.minimum(segment, ends.shape[0] - 1))
@@ -238,16 +240,55 @@ def cut(
     return Pieces(segment, pixel, range_, exists & inside & (range_[0] < range_[1]))
 
 
-def no_pieces(segments: Segments) -> Pieces:
-    """As many as are cut at once, none of which exists."""
-    integer = jnp.zeros(PIECES_AT_ONCE, jnp.int32) + (segments.parts[0] & 0)
+class Waiting(NamedTuple):
+    """Pieces to be looked at, and how many they are; `exists` means nothing here."""
+
+    pieces: Pieces
+    total: Int[Array, ""]
+
+
+def none_waiting(segments: Segments) -> Waiting:
+    """Room for pieces of segments."""
+    integer = jnp.zeros(PIECES_AT_ONCE + CUT_AT_ONCE, jnp.int32) + (segments.parts[0] & 0)
     ends = jnp.stack([integer, integer])
-    return Pieces(integer, ends, ends.astype(segments.range.dtype), integer > 0)
+    pieces = Pieces(integer, ends, ends.astype(segments.range.dtype), integer > 0)
+    return Waiting(pieces, segments.parts[0] & 0)
 
 
-def gathered(pieces: Pieces) -> Pieces:
-    """Those that exist first."""
+def behind(waiting: Waiting, pieces: Pieces, count: Array) -> Waiting:
+    """The same with the first ones of others put behind, if fewer wait than are looked at."""
+
+    def put(old: Array, new: Array) -> Array:
+        return lax.dynamic_update_slice_in_dim(old, new, waiting.total, axis=-1)
+
+    return Waiting(jax.tree.map(put, waiting.pieces, pieces), waiting.total + count)
+
+
+def first_ones(waiting: Waiting) -> Pieces:
+    """As many as are looked at at once."""
+    pieces = jax.tree.map(lambda column: column[..., :PIECES_AT_ONCE], waiting.pieces)
+    return pieces._replace(exists=jnp.arange(PIECES_AT_ONCE) < waiting.total)
+
+
+def instead_of_first(waiting: Waiting, pieces: Pieces) -> Waiting:
+    """What waits if only those of others that exist take the place of the `first_ones`."""
+    pieces, count = gathered(pieces)
+    others = jax.tree.map(lambda column: column[..., PIECES_AT_ONCE:], waiting.pieces)
+    rest = behind(Waiting(waiting.pieces, count), others, waiting.total - PIECES_AT_ONCE)
+    place = jnp.arange(waiting.pieces.exists.size)
+    room = [(0, CUT_AT_ONCE)]
+
+    def put(new: Array, old: Array) -> Array:
+        new = jnp.pad(new, [(0, 0)] * (new.ndim - 1) + room)
+        return jnp.where(place < count, new, old)
+
+    columns = jax.tree.map(put, pieces, rest.pieces)
+    return Waiting(columns, jnp.maximum(rest.total, count))
+
+
+def gathered(pieces: Pieces) -> tuple[Pieces, Int[Array, ""]]:
+    """Those that exist first, and how many they are."""
     number = jnp.arange(pieces.exists.size, dtype=jnp.int32)
     order, count = compacted(pieces.exists, number)
     segment, pixel, range_, _ = (column[..., order] for column in pieces)
-    return Pieces(segment, pixel, range_, number < count)
+    return Pieces(segment, pixel, range_, number < count), count

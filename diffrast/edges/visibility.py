@@ -33,6 +33,7 @@ from diffrast.edges.planes import (
     area,
     barycentrics,
     corners_of,
+    covers,
     edge_values,
     inverse_depth_slope,
     on_edge,
@@ -72,6 +73,40 @@ class Seen(NamedTuple):
     begin: Float[Array, "2 n"]  # ends of the part, from the pixel's centre
     end: Float[Array, "2 n"]
     middle: Float[Array, " n"]  # of the part on the clipped edge, as seen on the screen
+
+
+def uncovered(
+    pieces: Pieces,
+    segments: Segments,
+    faces: Int[Array, "F 3"],
+    pixels: Table,
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> Pieces:
+    """Pieces without those that the face seen at their pixel's centre hides all along.
+
+    Most are left out where many surfaces lie one behind the other.
+    """
+    column, row = pieces.pixel
+    face = stored(face_image[row + 1, column + 1])
+    own, weights, ends = stored(
+        (
+            segments.faces[:, pieces.segment],
+            segments.weights[:, pieces.segment],
+            segments.ends[..., pieces.segment],
+        )
+    )
+    along = ends[1] - ends[0]
+    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
+    aside = along * (_BEFORE / jnp.where(length > 0, length, 1))
+    sides = jnp.stack([-aside, aside])
+    x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
+    y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
+    values, depth = edge_values(corners_of(face, faces, pixels)[:, :, None, None], *stored((x, y)))
+    own_depth = weights[0] + pieces.range * (weights[1] - weights[0])
+    before = covers(values) & (depth > own_depth * (1 + FINE_TOLERANCE))
+    foreign = (face >= 0) & (face != own[0]) & (face != own[1])
+    hidden = foreign & jnp.all(before, axis=(0, 1))
+    return pieces._replace(exists=pieces.exists & ~hidden)
 
 
 def look(
