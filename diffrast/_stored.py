@@ -17,13 +17,17 @@ from jax import Array, lax
 T = TypeVar("T")
 
 
-def stored(values: T) -> T:
-    """Store every array of numbers in a tree."""
+def stored(values: T, witness: Array | None = None) -> T:
+    """Store every array of numbers in a tree.
+
+    The one is made of the values themselves or, where these have to stay linear, of the witness:
+    an array that is no tangent, of their shape.
+    """
 
     def store(value: Array) -> Array:
         if value.dtype == bool:
             return value
-        same = lax.stop_gradient(value)
+        same = lax.stop_gradient(value if witness is None else witness)
         is_number = (same < 0) | (same >= 0) | (same != same)
         return lax.div(value, jnp.where(is_number, 1, 2).astype(value.dtype))
 

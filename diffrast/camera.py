@@ -337,7 +337,7 @@ def viewpoint(camera: Camera) -> Float[Array, "4"]:
     `normalize(viewpoint[:3] - viewpoint[3] * p)`. A projection without a centre gives zeros.
     """
     _check_single(camera)
-    matrix, pivot = _pivoted_matrix(camera)
+    matrix, pivot = pivoted_matrix(camera)
     point = null_vector(matrix[np.array([0, 1, 3])])
     point = jnp.where(dot(matrix[2], point) > 0, -point, point)
     size = jnp.where(point[3] != 0, jnp.abs(point[3]), jnp.max(jnp.abs(point[:3])))
@@ -365,7 +365,7 @@ def pixel_directions(
     if camera.distortion is not None:
         raise ValueError("camera: wanted one without distortion")
     height, width = positive_int("height", height), positive_int("width", width)
-    first, second, depth, last = _pivoted_matrix(camera)[0][:, :3]
+    first, second, depth, last = pivoted_matrix(camera)[0][:, :3]
     # The ray lies in the plane of its column, first - x last, and in that of its row.
     steps = jnp.stack(
         [jnp.cross(second, last) * (2 / width), jnp.cross(first, last) * (2 / height)]
@@ -402,7 +402,7 @@ def _check_single(camera: Camera) -> None:
         )
 
 
-def _pivoted_matrix(camera: Camera) -> tuple[Float[Array, "4 4"], Float[Array, "3"]]:
+def pivoted_matrix(camera: Camera) -> tuple[Float[Array, "4 4"], Float[Array, "3"]]:
     """World to clip for positions relative to a pivot near the eye, and the pivot.
 
     The pivot carries no gradient; it keeps large translations out of what follows.

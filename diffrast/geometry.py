@@ -10,13 +10,21 @@ from jaxtyping import Float, Int
 
 from diffrast._stored import stored_rows
 from diffrast._topology import Edges, Topology, traced_topology
-from diffrast.camera import Camera, world_to_clip
+from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
 from diffrast.linalg import mirrors, transform_normals, transform_points
 from diffrast.mesh import face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
-from diffrast.raster.fragments import evaluate_fragments
+from diffrast.raster.evaluate import (
+    Carried,
+    Drawn,
+    Pixels,
+    Projection,
+    all_pixels,
+    evaluate,
+)
+from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 
 _SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
@@ -41,6 +49,8 @@ class Points(NamedTuple):
     face: Int[Array, "*size"]
     barycentrics: Columns
     inverse_depth: Float[Array, "*size"]
+    position: Columns | None = None  # world positions, if they are interpolated already
+    normal: Columns | None = None  # likewise
 
 
 def world_geometry(scene: Scene, shading: str) -> Geometry:
@@ -95,26 +105,69 @@ def clip_positions(geometry: Geometry, camera: Camera) -> Float[Array, "V 4"]:
         return stored_rows(world_to_clip(camera, geometry.positions))
 
 
-def visible_points(
-    geometry: Geometry, positions_clip: Array, height: int, width: int, cull_backfaces: bool
-) -> Points:
-    """What each pixel centre sees."""
+def draw(
+    geometry: Geometry,
+    camera: Camera,
+    positions_clip: Array,
+    height: int,
+    width: int,
+    *,
+    cull_backfaces: bool,
+    border: int = 0,
+) -> tuple[Drawn, Int[Array, "_ _"]]:
+    """What is drawn in an image with so many pixels round it, and the face that each pixel sees."""
+    seen_clip = with_border(positions_clip, height, width, border)
     with jax.named_scope("rasterize"):
         face = visible_faces(
-            jax.lax.stop_gradient(positions_clip),
+            jax.lax.stop_gradient(seen_clip),
             geometry.faces_outward if cull_backfaces else geometry.faces,
-            height=height,
-            width=width,
+            height=height + 2 * border,
+            width=width + 2 * border,
             cull_backfaces=cull_backfaces,
         )
+    attributes = [geometry.positions]
+    if geometry.normals is not None:
+        attributes.append(geometry.normals)
+    projection = None
+    if camera.distortion is None:
+        matrix, pivot = pivoted_matrix(camera)
+        seen_matrix = with_border(matrix.T, height, width, border).T
+        projection = Projection(seen_matrix[np.array([0, 1, 3])], pivot)
+    return Drawn(seen_clip, geometry.faces, tuple(attributes), projection), face
+
+
+def points_at(drawn: Drawn, pixels: Pixels, carried: Carried | None = None) -> Points:
+    """What pixels see of what is drawn; `carried` as for `evaluate`."""
     with jax.named_scope("fragments"):
-        return Points(face, *evaluate_fragments(positions_clip, geometry.faces, face))
+        seen = evaluate(drawn, pixels, carried)
+        return Points(pixels.face, seen.barycentrics, seen.inverse_depth, *seen.attributes)
+
+
+def visible_points(drawn: Drawn, face: Array) -> Points:
+    """What all pixels of an image see."""
+    return points_at(drawn, all_pixels(face, drawn.positions_clip.dtype))
 
 
 def at_points(attribute: Array, geometry: Geometry, points: Points) -> Columns:
     """Values at the vertices, (V, C), interpolated at points."""
     columns = [attribute[:, i] for i in range(attribute.shape[1])]
     return interpolate_columns(columns, geometry.faces, points.face, points.barycentrics)
+
+
+def positions_at(geometry: Geometry, points: Points) -> Columns:
+    """World positions of points."""
+    if points.position is not None:
+        return points.position
+    return at_points(geometry.positions, geometry, points)
+
+
+def normals_at(geometry: Geometry, points: Points) -> Columns:
+    """World normals at points, of any length: those of the vertices, if there are any."""
+    if geometry.normals is None:
+        return flat_normals(geometry, points.face)
+    if points.normal is not None:
+        return points.normal
+    return at_points(geometry.normals, geometry, points)
 
 
 def uvs_at(geometry: Geometry, points: Points) -> Columns:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from diffrast._check import ArrayInput, float_array, index_array, positive_int
 from diffrast._stored import assemble
 from diffrast.raster import Fragments
-from diffrast.raster.fragments import corners_at
+from diffrast.raster.evaluate import corners_at
 
 
 def interpolate(

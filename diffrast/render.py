@@ -14,20 +14,21 @@ from jaxtyping import Float, Int
 
 from diffrast._stored import assemble, stored
 from diffrast.camera import Camera
+from diffrast.deferred import shade_covered
 from diffrast.edges import Glow, Shader, View, antialias_image
 from diffrast.geometry import (
     Points,
     apart_edges,
-    at_points,
     clip_positions,
-    flat_normals,
+    draw,
+    normals_at,
+    positions_at,
     scene_topology,
     uvs_at,
     visible_points,
     world_geometry,
 )
 from diffrast.light import Columns, casts_shadow, normalize_columns
-from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
 from diffrast.shadows import Parted, Reached, parted, terminators
@@ -92,16 +93,25 @@ def render(
         return jnp.broadcast_to(scene.background, (settings.height, settings.width, 3))
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
-    size, seen_clip = (height, width), clip
-    if settings.antialias:  # a border of one pixel shows what lies beyond the edges there
-        size, seen_clip = (height + 2, width + 2), with_border(clip, height, width, 1)
-    pixels = visible_points(geometry, seen_clip, *size, settings.cull_backfaces)
+    drawn, face = draw(  # a border of one pixel shows what lies beyond the edges there
+        geometry,
+        camera,
+        clip,
+        height,
+        width,
+        cull_backfaces=settings.cull_backfaces,
+        border=border,
+    )
     with jax.named_scope("shade"):
+        pixels = visible_points(jax.lax.stop_gradient(drawn), face)  # if there are shadows
         world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
         world = world._replace(paints=paint_scene(scene, geometry, clip, height, width))
-        color = SHADERS[settings.shading](world, pixels, reached)
-        covered = pixels.face >= 0
-        color = [jnp.where(covered, color[c], background[..., c]) for c in range(3)]
+        # Others look at all vertices or texels for each batch.
+        in_batches = settings.shading == "phong" and not world.paints
+
+        shader = SHADERS[settings.shading]
+        color = shade_covered(shader, world, drawn, face, reached, in_batches=in_batches)
+        color = [jnp.where(face >= 0, color[c], background[..., c]) for c in range(3)]
     if settings.antialias:
         with jax.named_scope("edges"):
             image = assemble(stored(color))
@@ -127,11 +137,9 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         return Buffers(nothing, nothing, three, three[..., 0], three, three, None, lit)
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
-    pixels = visible_points(geometry, clip, *size, settings.cull_backfaces)
-    if settings.shading == "flat" or geometry.normals is None:
-        columns = flat_normals(geometry, pixels.face)
-    else:
-        columns = at_points(geometry.normals, geometry, pixels)
+    drawn = draw(geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
+    pixels = visible_points(*drawn)
+    columns = normals_at(geometry, pixels)
     lighting = "flat" if settings.shading == "unlit" else settings.shading
     _, reached = cast_shadows(scene, camera, geometry, pixels, lighting)
     lit_parts = [part for part in reached if part is not None]
@@ -147,7 +155,7 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         object=jnp.where(covered, object_of_face, -1),
         barycentrics=jnp.stack(pixels.barycentrics, axis=-1),
         inverse_depth=pixels.inverse_depth,
-        position=stacked(at_points(geometry.positions, geometry, pixels)),
+        position=stacked(positions_at(geometry, pixels)),
         normal=stacked(normal),
         uv=None if geometry.uvs is None else stacked(uvs_at(geometry, pixels)),
         lit=stacked(lit_parts) if lit_parts else None,
@@ -177,7 +185,8 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
     size = settings.height, settings.width
-    pixels = visible_points(geometry, clip, *size, settings.cull_backfaces)
+    drawn = draw(geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
+    pixels = visible_points(*drawn)
     lighting = "flat" if settings.shading == "unlit" else settings.shading
     world, reached = cast_shadows(scene, camera, geometry, pixels, lighting)
     topology = scene_topology(scene)

@@ -12,7 +12,7 @@ from jax import Array
 from diffrast._topology import Topology
 from diffrast.camera import Camera, direction_to_clip, viewpoint, world_to_clip
 from diffrast.edges import Cast
-from diffrast.geometry import Geometry, Points, at_points, flat_normals
+from diffrast.geometry import Geometry, Points, at_points, normals_at, positions_at
 from diffrast.light import (
     AmbientLight,
     Columns,
@@ -103,10 +103,7 @@ def glow(shading: str, world: World, light: Array, points: Points) -> Columns:
 
 def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
     scene, camera, geometry = world[:3]
-    if geometry.normals is None:
-        normal = flat_normals(geometry, points.face)
-    else:
-        normal = at_points(geometry.normals, geometry, points)
+    normal = normals_at(geometry, points)
     reflectance = _reflectance(scene, geometry.object_of_face, points.face)
     texel = texel_colors(scene, world.paints, geometry, points)
     if texel is not None:
@@ -114,7 +111,7 @@ def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
             ambient=_times(reflectance.ambient, texel), diffuse=_times(reflectance.diffuse, texel)
         )
     with_position, with_viewer = needs(scene.lights, reflectance.specular is not None)
-    position = at_points(geometry.positions, geometry, points) if with_position else None
+    position = positions_at(geometry, points) if with_position else None
     to_viewer = _to_viewer(camera, position) if with_viewer else None
     distance = _viewer_distance(scene.lights, camera, position)
     surface = Surface(normal, position, to_viewer, distance)

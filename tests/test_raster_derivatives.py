@@ -10,7 +10,7 @@ from drawing import draw, perspective, soup
 
 from diffrast.camera import world_to_clip
 from diffrast.raster import rasterize
-from diffrast.raster.fragments import evaluate_fragments
+from diffrast.raster.evaluate import Drawn, all_pixels, evaluate
 
 SIZE = 16
 RNG = np.random.default_rng(0)
@@ -29,10 +29,9 @@ def values(positions_clip, faces):
 
 
 def at_fixed_faces(positions_clip, faces, face):
-    barycentrics, inverse_depth = evaluate_fragments(
-        positions_clip, jnp.asarray(faces), jnp.asarray(face)
-    )
-    return jnp.stack(barycentrics, axis=-1), inverse_depth
+    drawn = Drawn(positions_clip, jnp.asarray(faces))
+    seen = evaluate(drawn, all_pixels(jnp.asarray(face), positions_clip.dtype))
+    return jnp.stack(seen.barycentrics, axis=-1), seen.inverse_depth
 
 
 def assert_transposed(slope, gradient, weights, direction, tolerance):

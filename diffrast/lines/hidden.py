@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast.lines.segments import depth_rank
 from diffrast.raster import Fragments
-from diffrast.raster.fragments import corners_at
+from diffrast.raster.evaluate import corners_at
 
 _ROUNDINGS = 16  # of a depth key, relative to it
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from diffrast._stored import stored
 from diffrast._topology import Edges
-from diffrast.geometry import Geometry, Points, at_points
+from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, ShiningLight, casts_shadow
 from diffrast.linalg import dot
 from diffrast.mesh import face_normals
@@ -107,7 +107,7 @@ def _regards(
     geometry: Geometry,
     points: Points,
 ) -> list[_Regard]:
-    position = at_points(geometry.positions, geometry, points)
+    position = positions_at(geometry, points)
     visible = jnp.maximum(points.face, 0)
     regards = []
     for light, view, outside in zip(lights, views, turned, strict=True):

@@ -21,7 +21,7 @@ from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
 from diffrast.edges.planes import edge_functions
-from diffrast.geometry import Geometry, Points, at_points
+from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution
 from diffrast.shadows.lit import Rays, face_corners, faces_near
@@ -161,8 +161,7 @@ def _edge_between(
 ) -> Int[Array, " n"]:
     """The edge whose shadow passes between points in the dark and others in the light."""
     at_dark, at_bright = (
-        stored(jnp.stack(at_points(geometry.positions, geometry, points)))
-        for points in (dark, bright)
+        stored(jnp.stack(positions_at(geometry, points))) for points in (dark, bright)
     )
     picture = stored(_picture(lamps, lamp, at_dark - pictures.plan.origin[lamps.first][lamp].T))
     origin = stored(pictures.plan.origin[picture].T)

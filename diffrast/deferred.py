@@ -1,0 +1,166 @@
+"""Shading the pixels that see something.
+
+A picture alone is shaded in one go. With its derivative there are hundreds of values for each pixel
+between faces and colours, more than memory can pass along in good time: so the image is cut into
+runs of pixels, runs without a face are left out, and the others are shaded in batches that stay in
+cache. A reverse pass goes through the batches again and begins by repeating each.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Int
+
+from diffrast._selection import compacted
+from diffrast._varying import varying_alike
+from diffrast.geometry import Points, points_at
+from diffrast.light import Columns
+from diffrast.raster.evaluate import Drawn, Pixels, all_pixels, carry
+from diffrast.shadows import Reached
+
+RUN = 32  # pixels
+RUNS_AT_ONCE = 512
+
+
+class _Runs(NamedTuple):
+    """The runs of an image's pixels, row by row, that hold something."""
+
+    chosen: Int[Array, " places"]  # numbers of runs; behind the last one that of no run
+    place: Int[Array, " runs"]  # of each run among these; that of none if it is left out
+    total: Int[Array, ""]  # that hold something
+
+
+Data = TypeVar("Data")
+
+
+def shade_covered(
+    shade: Callable[[Data, Points, Reached], Columns],
+    data: Data,
+    drawn: Drawn,
+    face: Int[Array, "height width"],
+    reached: Reached,
+    *,
+    in_batches: bool,
+) -> Columns:
+    """Colours of the pixels that see a face, in whole images; of no meaning elsewhere.
+
+    Args:
+        shade: colours of points, one array a channel.
+        data: a tree of all arrays that it uses. Differentiated in batches, each array costs a pass
+            over it for every batch.
+        drawn: what is drawn.
+        face: that each pixel sees, -1 for none.
+        reached: by each light; images.
+        in_batches: whether derivatives of large images are.
+    """
+    inputs = data, drawn, face, reached
+    if not in_batches or face.size <= RUN * RUNS_AT_ONCE:
+        return _in_one_go(shade, *inputs)
+
+    @jax.custom_jvp
+    def colors(inputs: Any) -> Columns:
+        return _in_one_go(shade, *inputs)
+
+    def derivative(primals: Any, tangents: Any) -> tuple[Columns, Columns]:
+        leaves, tree = jax.tree.flatten(primals[0])
+        changes = jax.tree.leaves(tangents[0])
+        moving = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
+
+        def of_moving(*values: Array) -> Columns:
+            given = dict(zip(moving, values, strict=True))
+            parts = [given.get(i, leaf) for i, leaf in enumerate(leaves)]
+            return _in_batches(shade, *jax.tree.unflatten(tree, parts))
+
+        return jax.jvp(of_moving, [leaves[i] for i in moving], [changes[i] for i in moving])
+
+    colors.defjvp(derivative, symbolic_zeros=True)
+    return colors(inputs)
+
+
+def _in_one_go(
+    shade: Callable[[Data, Points, Reached], Columns],
+    data: Data,
+    drawn: Drawn,
+    face: Array,
+    reached: Reached,
+) -> Columns:
+    return shade(data, points_at(drawn, all_pixels(face, drawn.positions_clip.dtype)), reached)
+
+
+def _in_batches(
+    shade: Callable[[Data, Points, Reached], Columns],
+    data: Data,
+    drawn: Drawn,
+    face: Array,
+    reached: Reached,
+) -> Columns:
+    dtype = drawn.positions_clip.dtype
+    runs = _covered_runs(face)
+    width, height = face.shape[1], face.shape[0]
+    number = runs.chosen[:, None] * RUN + jnp.arange(RUN)
+    column, row = number % width, number // width
+    pixels = Pixels(
+        _batched(_taken(face, runs, -1)),
+        _batched((2 * column + 1 - width).astype(dtype)),
+        _batched((height - 1 - 2 * row).astype(dtype)),
+        jnp.asarray(height, dtype),
+        jnp.asarray(width, dtype),
+    )
+    parts = tuple(None if part is None else _batched(_taken(part, runs, 0)) for part in reached)
+    # What vertices move is collected by faces: of few in every batch, of many in one go.
+    many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
+    carried = carry(drawn, pixels) if many else None
+    data, drawn, pixels, carried, parts, total = varying_alike(
+        (data, drawn, pixels, carried, parts, runs.total)
+    )
+    first = jnp.arange(pixels.face.shape[0]) * RUNS_AT_ONCE + 0 * total
+
+    def shade_batch(batch: Any) -> Columns:
+        _, face, x, y, carried, reached = batch
+        points = points_at(drawn, pixels._replace(face=face, x=x, y=y), carried)
+        return shade(data, points, reached)
+
+    def no_colors(batch: Any) -> Columns:
+        return [jnp.zeros_like(batch[2])] * 3
+
+    def step(batch: Any) -> Columns:
+        return lax.cond(batch[0] < total, shade_batch, no_colors, batch)
+
+    batches = (first, *pixels[:3], carried, parts)
+    colors = lax.map(jax.checkpoint(step, prevent_cse=False), batches)
+    return [_put_back(color, runs, face.shape) for color in colors]
+
+
+def _covered_runs(face: Array) -> _Runs:
+    in_runs = _in_runs(face, -1)
+    covered = jnp.max(in_runs, axis=1) >= 0
+    count = covered.shape[0]
+    places = -(-count // RUNS_AT_ONCE) * RUNS_AT_ONCE
+    chosen, total = compacted(covered, jnp.arange(count, dtype=jnp.int32))
+    chosen = jnp.where(jnp.arange(count) < total, chosen, count)
+    chosen = jnp.pad(chosen, (0, places - count), constant_values=count)
+    place = jnp.full(count + 1, places).at[chosen].set(jnp.arange(places), mode="drop")[:-1]
+    return _Runs(chosen, place, total)
+
+
+def _in_runs(image: Array, fill: float) -> Array:
+    size = -(-image.size // RUN) * RUN
+    flat = jnp.pad(image.reshape(-1), (0, size - image.size), constant_values=fill)
+    return flat.reshape(-1, RUN)
+
+
+def _taken(image: Array, runs: _Runs, fill: float) -> Array:
+    return _in_runs(image, fill).at[runs.chosen].get(mode="fill", fill_value=fill)
+
+
+def _batched(pixels: Array) -> Array:
+    return pixels.reshape(-1, RUNS_AT_ONCE * RUN)
+
+
+def _put_back(values: Array, runs: _Runs, shape: tuple[int, ...]) -> Array:
+    rows = values.reshape(-1, RUN).at[runs.place].get(mode="fill", fill_value=0)
+    return rows.reshape(-1)[: shape[0] * shape[1]].reshape(shape)
