@@ -25,7 +25,6 @@ half an hour on two cores, most of it compilation.
 
 import argparse
 import functools
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ import peers
 from benchmark_raster import scenes as benchmark_scenes
 from common import pyplot, save_json
 from peers import POSE, Peer, Task, in_floats
+from timing import minimum_times
 
 import diffrast as dr
 
@@ -145,14 +145,7 @@ def take_turns(found: Sequence[Peer], repeats: int) -> dict[str, dict[str, float
         for peer in found
         if peer.differentiable
     }
-    for job in jobs.values():
-        job()
-    times: dict[tuple[str, str], float] = dict.fromkeys(jobs, np.inf)
-    for _ in range(repeats):
-        for key, job in jobs.items():
-            start = time.perf_counter()
-            job()
-            times[key] = min(times[key], 1e3 * (time.perf_counter() - start))
+    times = minimum_times(jobs, repeats)
     return {
         peer.name: {kind: times.get((peer.name, kind)) for kind in ("forward_ms", "both_ms")}
         for peer in found
@@ -214,7 +207,7 @@ def qualities(task: Task, found: Sequence[Peer], samples: int) -> dict[str, dict
             exact_picture(task.size, peers.arguments_of(task), jnp.zeros(12), how)
         )
         # Two steps: a difference that has converged does not depend on it.
-        slopes[shading], other = (pose_derivative(task, field, how, step) for step in (0.5, 1.0))
+        slopes[shading], other = (pose_derivative(task, field, how, step) for step in (0.25, 0.5))
         spreads[shading] = relative_error(other, slopes[shading])
     results: dict[str, dict[str, Any]] = {}
     for peer in found:
