@@ -173,12 +173,17 @@ class Deodr(Peer):
             raise MissingPeerError("DEODR needs deodr: install diffrast[peers]") from error
 
         class PoseCamera(Camera):
-            """Keeps the derivative by the points in its own system."""
+            """Keeps the derivative by the points in its own system.
 
-            def project_points_backward(self, points_b: Any, *args: Any, **options: Any) -> Any:
-                vertices_b = super().project_points_backward(points_b, *args, **options)
-                self.eye_b = vertices_b @ self.extrinsic[:, :3].T
-                return vertices_b
+            DEODR 0.2.3 multiplies it by the transpose of the rotation that leads to the world.
+            """
+
+            def project_points_backward(self, points_b: Any, store_backward: Any) -> Any:
+                _, depths, projected = store_backward["project_points"]
+                plane_b = points_b @ self.intrinsic[:2, :2] / depths[:, None]
+                depths_b = -(plane_b * projected).sum(axis=1)
+                self.eye_b = np.column_stack([plane_b, depths_b])
+                return self.eye_b @ self.extrinsic[:, :3]
 
         vertices = np.asarray(task.mesh.vertices, np.float64)
         mesh = ColoredTriMesh(
@@ -200,7 +205,7 @@ class Deodr(Peer):
 
     def image(self) -> np.ndarray:
         self.scene.mesh.set_vertices(self.vertices)
-        return self.scene.render(self.camera, backface_culling=self.task.closed)
+        return self.scene.render(self.camera)  # its derivative needs back faces culled
 
     def gradient(self, target: np.ndarray) -> np.ndarray:
         image = self.image()
