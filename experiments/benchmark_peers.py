@@ -29,14 +29,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import peers
 from benchmark_raster import scenes as benchmark_scenes
 from common import pyplot, save_json
-from peers import POSE, Peer, Task, in_floats
-from timing import minimum_times
+from exactness import qualities
+from peers import Peer, Task, in_floats
+from timing import markdown, minimum_times, three_digits
 
 import diffrast as dr
 
@@ -153,94 +152,6 @@ def take_turns(found: Sequence[Peer], repeats: int) -> dict[str, dict[str, float
     }
 
 
-# How exact? ---------------------------------------------------------------------------------------
-
-
-@functools.partial(jax.jit, static_argnums=(0, 3))
-def exact_picture(size: int, arguments: Any, parameters: jax.Array, how: tuple[str, int]) -> Any:
-    """Many samples a pixel, no treatment of edges; `how`: shading and samples."""
-    shading, samples = how
-    settings = dr.RenderSettings(
-        height=size, width=size, samples=samples, antialias=False, shading=shading
-    )
-    return peers.draw(arguments, parameters, settings)
-
-
-def pose_steps(task: Task) -> np.ndarray:
-    """Changes of the six pose parameters that move the mesh by one pixel on average."""
-    vertices = np.asarray(task.mesh.vertices, np.float64)
-    view = np.asarray(task.camera.view, np.float64)
-    eye = vertices @ view[:3, :3].T + view[:3, 3]
-    moves = [np.cross(axis, eye) for axis in np.eye(3)]
-    moves += [np.broadcast_to(axis, eye.shape) for axis in np.eye(3)]
-    steps = []
-    for move in moves:
-        depth = -eye[:, 2:]
-        pixels = (move[:, :2] + eye[:, :2] * move[:, 2:] / depth) / depth
-        pixels = pixels * task.focal * task.size / 2
-        steps.append(1 / np.sqrt((pixels**2).sum(axis=1).mean()))
-    return np.array(steps)
-
-
-def exact_slopes(
-    task: Task, field: np.ndarray, how: tuple[str, int], directions: np.ndarray, step: float
-) -> np.ndarray:
-    """Central differences of the exact picture's sum weighted by a field, along motions."""
-    arguments, scale = peers.arguments_of(task), pose_steps(task)
-    slopes = []
-    for direction in directions * scale:
-        ahead, behind = (
-            exact_picture(task.size, arguments, jnp.zeros(12).at[POSE].set(sign * direction), how)
-            for sign in (step, -step)
-        )
-        change = np.asarray(ahead, np.float64) - np.asarray(behind, np.float64)
-        slopes.append((change * field).sum() / (2 * step))
-    return np.array(slopes)
-
-
-def qualities(task: Task, found: Sequence[Peer], samples: int) -> dict[str, dict[str, Any]]:
-    """Errors of pictures and pose derivatives."""
-    generator = np.random.default_rng(0)
-    coarse = jnp.asarray(generator.normal(size=(12, 12, 3)))
-    field = np.asarray(jax.image.resize(coarse, (task.size, task.size, 3), "cubic"), np.float64)
-    exact, slopes, spreads = {}, {}, {}
-    for shading in {peer.shading for peer in found}:
-        how = (shading, samples)
-        exact[shading] = np.asarray(
-            exact_picture(task.size, peers.arguments_of(task), jnp.zeros(12), how)
-        )
-        slopes[shading] = exact_slopes(task, field, how, np.eye(6), 0.5)
-        # A difference that has converged does not depend on its step.
-        some = slopes[shading] / np.linalg.norm(slopes[shading])
-        other = exact_slopes(task, field, how, some[None], 0.25)[0]
-        spreads[shading] = abs(float(other / (some @ slopes[shading])) - 1)
-    results: dict[str, dict[str, Any]] = {}
-    for peer in found:
-        difference = in_floats(peer.image()) - exact[peer.shading]
-        result: dict[str, Any] = {
-            "rmse": float(np.sqrt((difference**2).mean())),
-            "mean_difference": float(np.abs(difference).mean()),
-        }
-        if peer.differentiable:
-            # From a target far enough away the squared difference is linear in the picture.
-            target = np.float32(-1e3 * field)
-            slope = peer.gradient(target)[POSE] / 2e3 * pose_steps(task)
-            wanted = slopes[peer.shading]
-            norms = np.linalg.norm(slope) * np.linalg.norm(wanted)
-            result |= {
-                "gradient_error": relative_error(slope, wanted),
-                "gradient_cosine": float(slope @ wanted / norms),
-                "reference_spread": spreads[peer.shading],
-            }
-        results[peer.name] = result
-    return results
-
-
-def relative_error(value: np.ndarray, wanted: np.ndarray) -> float:
-    """Length of the difference over that of what was wanted."""
-    return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
-
-
 # Run and report -----------------------------------------------------------------------------------
 
 
@@ -301,7 +212,7 @@ def _line(cell: dict[str, dict[str, float | None]]) -> str:
 
 
 def _times(times: dict[str, float | None]) -> str:
-    return " / ".join(f"{value:.3g}" for value in times.values() if value is not None)
+    return " / ".join(three_digits(value) for value in times.values() if value is not None)
 
 
 def speeds(times: dict[str, Any]) -> dict[str, Any]:
@@ -333,34 +244,36 @@ def tables(report: dict[str, Any]) -> str:
 def times_table(report: dict[str, Any]) -> str:
     """Milliseconds, forward / with derivative; the last column is the best peer over ours."""
     times, speed = report["times"], report["speed"]
-    names = list(
-        dict.fromkeys(n for by_size in times.values() for c in by_size.values() for n in c)
-    )
-    lines = ["| scene | size | " + " | ".join(names) + " | best peer / ours |"]
-    lines.append("|---" * (len(names) + 3) + "|")
+    names = renderers(times)
+    rows = []
     for scene, by_size in times.items():
         for size, cell in by_size.items():
             ratios = speed["best_peer_over_ours"][f"{scene}, {size}"]
             columns = [_times(cell[name]) if name in cell else "" for name in names]
             columns.append(" / ".join(f"{ratio:.2f}" for ratio in ratios.values()))
-            lines.append(f"| {scene} | {size}² | " + " | ".join(columns) + " |")
+            rows.append([scene, f"{size}²", *columns])
     means = [f"{mean:.2f}" for mean in speed["geometric_mean"].values() if mean is not None]
-    lines.append("| geometric mean | " + "| " * (len(names) + 1) + "| " + " / ".join(means) + " |")
-    return "\n".join(lines)
+    rows.append(["geometric mean", "", *[""] * len(names), " / ".join(means)])
+    return markdown(["scene", "size", *names, "best peer / ours"], rows)
 
 
 def errors_table(errors: dict[str, Any]) -> str:
     """Root mean square and mean error of pictures; error and cosine of derivatives by the pose."""
-    lines = ["| scene | renderer | picture, rms | mean | pose derivative, error | cosine |"]
-    lines.append("|---" * 6 + "|")
+    rows = []
     for scene, by_peer in errors.items():
         for name, e in by_peer.items():
-            slope = "| |"
+            slope = ["", ""]
             if "gradient_error" in e:
-                slope = f"| {100 * e['gradient_error']:.2g} % | {e['gradient_cosine']:.4f} |"
-            picture = f"{e['rmse']:.5f} | {e['mean_difference']:.6f}"
-            lines.append(f"| {scene} | {name} | {picture} {slope}")
-    return "\n".join(lines) if errors else ""
+                slope = [f"{100 * e['gradient_error']:.2g} %", f"{e['gradient_cosine']:.4f}"]
+            rows.append([scene, name, f"{e['rmse']:.5f}", f"{e['mean_difference']:.6f}", *slope])
+    header = ["scene", "renderer", "picture, rms", "mean", "pose derivative, error", "cosine"]
+    return markdown(header, rows) if rows else ""
+
+
+def renderers(times: dict[str, Any]) -> list[str]:
+    """Names of all that were timed, ours first."""
+    cells = [cell for by_size in times.values() for cell in by_size.values()]
+    return list(dict.fromkeys(name for cell in cells for name in cell))
 
 
 def plot(report: dict[str, Any], path: Path) -> None:

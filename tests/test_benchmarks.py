@@ -7,6 +7,7 @@ import benchmark_features
 import benchmark_peers
 import benchmark_scaling
 import benchmark_stages
+import exactness
 import numpy as np
 import peers
 import pytest
@@ -118,7 +119,7 @@ def test_pose_steps_move_the_mesh_by_a_pixel(task):
     def pixels(points):
         return task.size / 2 * (points[:, :2] / -points[:, 2:]) @ clip
 
-    for i, step in enumerate(benchmark_peers.pose_steps(task)):
+    for i, step in enumerate(exactness.pose_steps(task)):
         axis = np.eye(3)[i % 3]
         moved = eye + 1e-4 * step * (np.cross(axis, eye) if i < 3 else axis)
         distance = np.linalg.norm(pixels(moved) - pixels(eye), axis=1)
