@@ -291,10 +291,17 @@ def plot(report: dict[str, Any], path: Path) -> None:
         sizes = [int(size) for size in by_size]
         for name in names:
             cells = [cell.get(name, {}) for cell in by_size.values()]
-            for kind, style in (("forward_ms", "o--"), ("both_ms", "o-")):
+            for kind, style, fill in (("forward_ms", "o--", "white"), ("both_ms", "o-", None)):
                 values = [cell.get(kind) or np.nan for cell in cells]
-                label = name if kind == "forward_ms" else None
-                axis.loglog(sizes, values, style, color=colors[name], label=label, markersize=4)
+                axis.loglog(
+                    sizes,
+                    values,
+                    style,
+                    color=colors[name],
+                    markerfacecolor=fill,
+                    label=name if kind == "forward_ms" else None,
+                    markersize=4,
+                )
         earlier = [both for _, both in EARLIER[scene]["diffren splat"]]
         known = [(s, t) for s, t in zip((256, 512, 1024), earlier, strict=True) if s in sizes]
         if known:
