@@ -111,7 +111,12 @@ def check(name: str, variant: Variant, image: jax.Array) -> None:
 
 
 def run(
-    out: Path, *, size: int = 512, repeats: int = 30, only: Sequence[str] | None = None
+    out: Path,
+    *,
+    size: int = 512,
+    repeats: int = 30,
+    only: Sequence[str] | None = None,
+    progress: bool = False,
 ) -> dict[str, Any]:
     """Time the variants; returns what is written: by variant, milliseconds and differences."""
     chosen = {name: v for name, v in variants().items() if only is None or name in only}
@@ -128,6 +133,9 @@ def run(
             jax.value_and_grad(loss), arguments[0], weights, *arguments[1:]
         )
         check(name, variant, jobs[name, "forward"]())
+        jax.block_until_ready(jobs[name, "both"]())
+        if progress:
+            print("compiled:", name, flush=True)
     times = minimum_times(jobs, repeats)
     report: dict[str, Any] = {"size": size, "repeats": repeats, "features": {}}
     for name, variant in chosen.items():
@@ -180,8 +188,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the picture")
     parser.add_argument("--repeats", type=int, default=30, help="timed runs of each")
     parser.add_argument("--only", nargs="+", metavar="FEATURE", help="and what it is compared with")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
-    print(table(run(options.pop("out"), **options)))
+    print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
 
 
 if __name__ == "__main__":

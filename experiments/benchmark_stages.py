@@ -186,7 +186,12 @@ def machine(repeats: int) -> dict[str, float]:
 
 
 def run(
-    out: Path, *, size: int = 512, repeats: int = 30, only: Sequence[str] | None = None
+    out: Path,
+    *,
+    size: int = 512,
+    repeats: int = 30,
+    only: Sequence[str] | None = None,
+    progress: bool = False,
 ) -> dict[str, Any]:
     """Time every stage of the scenes; returns what is written."""
     speed = machine(repeats)
@@ -198,6 +203,8 @@ def run(
         jobs = {(key, "alone"): compiled(s.function, *s.arguments) for key, s in found.items()}
         jobs |= {(key, "both"): with_pull_back(s) for key, s in found.items() if s.differentiable}
         times = minimum_times(jobs, repeats)
+        if progress:
+            print("timed:", name, flush=True)
         report["scenes"][name] = {}
         for key, stage in found.items():
             memory = stage.traffic / speed["bytes_per_ms"]
@@ -264,8 +271,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the picture")
     parser.add_argument("--repeats", type=int, default=30, help="timed runs of each")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="names of scenes")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
-    print(table(run(options.pop("out"), **options)))
+    print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
 
 
 if __name__ == "__main__":
