@@ -6,7 +6,7 @@ Each stage runs alone, on arrays that lie in memory, as the renderer runs it: ve
 space, face ids, barycentrics, interpolation of normals and positions, Phong shading with a
 highlight, edges, a shadow map and its look-up; and each that is differentiable once more with its
 pull-back of a random cotangent ("both"). A stage's bound is the larger of two times: the bytes that
-it must read and write once over the speed at which the same compiler copies an array, and its
+it must read and write once over the speed at which the same compiler copies a picture, and its
 multiply-adds (an estimate: 60 a face, 10 a tested pixel and face, and what shading a point takes)
 over the speed of a long polynomial on an array in the cache.
 
@@ -38,6 +38,7 @@ from diffrast.shadows import cast, receive
 
 SHADOW_SIZE = 512
 FLOAT = 4  # bytes
+STEPS, SMALL = 512, 1 << 14  # of a polynomial, and of the array that it is evaluated on
 
 
 class Stage(NamedTuple):
@@ -128,7 +129,7 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
             2,
         ),
         "Phong shading": Stage(
-            shade, (columns, columns[3:]), FLOAT * (9 + 3) * pixels, 90 * pixels, 2
+            shade, (columns, columns[3:]), FLOAT * (6 + 3) * pixels, 90 * pixels, 2
         ),
         "edges": Stage(
             antialias, (image, clip, wide.face), FLOAT * (4 * vertices + 7 * pixels), 0, 2
@@ -165,23 +166,19 @@ def with_pull_back(stage: Stage) -> Callable[[], Any]:
     return compiled(both, cotangent, *stage.arguments)
 
 
-def machine(repeats: int) -> dict[str, float]:
-    """Bytes and multiply-adds a millisecond, of programs by the same compiler."""
-    large, small = jnp.ones(1 << 24), jnp.full(1 << 14, 0.5)
-    steps = 512
+def yardsticks(size: int) -> dict[str, Callable[[], Any]]:
+    """Jobs that only move data, as many as a stage does, and that only multiply and add."""
 
     def polynomial(x: jax.Array) -> jax.Array:
         y = x
-        for _ in range(steps):
+        for _ in range(STEPS):
             y = y * x + x
         return y
 
-    times = minimum_times(
-        {"copy": compiled(lambda x: x + 1, large), "add": compiled(polynomial, small)}, repeats
-    )
+    moved = jnp.ones((4, size, size))
     return {
-        "bytes_per_ms": 2 * FLOAT * large.size / times["copy"],
-        "multiply_adds_per_ms": steps * small.size / times["add"],
+        "copy": compiled(lambda x: x + 1, moved),
+        "polynomial": compiled(polynomial, jnp.full(SMALL, 0.5)),
     }
 
 
@@ -194,21 +191,21 @@ def run(
     progress: bool = False,
 ) -> dict[str, Any]:
     """Time every stage of the scenes; returns what is written."""
-    speed = machine(repeats)
-    report: dict[str, Any] = {"size": size, "repeats": repeats, "machine": speed, "scenes": {}}
+    report: dict[str, Any] = {"size": size, "repeats": repeats, "scenes": {}}
     for name, (mesh, camera) in scenes().items():
         if only is not None and name not in only:
             continue
         found = stages(mesh, camera, size)
         jobs = {(key, "alone"): compiled(s.function, *s.arguments) for key, s in found.items()}
         jobs |= {(key, "both"): with_pull_back(s) for key, s in found.items() if s.differentiable}
+        jobs |= {(key, "machine"): job for key, job in yardsticks(size).items()}
         times = minimum_times(jobs, repeats)
         if progress:
             print("timed:", name, flush=True)
         report["scenes"][name] = {}
         for key, stage in found.items():
-            memory = stage.traffic / speed["bytes_per_ms"]
-            arithmetic = stage.multiply_adds / speed["multiply_adds_per_ms"]
+            memory = stage.traffic / (8 * FLOAT * size**2) * times["copy", "machine"]
+            arithmetic = stage.multiply_adds / (STEPS * SMALL) * times["polynomial", "machine"]
             bound = max(memory, arithmetic)
             report["scenes"][name][key] = {
                 "ms": times[key, "alone"],

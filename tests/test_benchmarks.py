@@ -90,6 +90,7 @@ def test_a_peer_that_is_not_installed_says_what_to_install(kind, module, task, m
         kind(task)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # their own
 @pytest.mark.parametrize("kind", peers.PEERS)
 def test_an_installed_peer_draws_the_same_picture(kind, task, own):
     try:
