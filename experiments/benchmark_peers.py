@@ -264,7 +264,7 @@ def errors_table(errors: dict[str, Any]) -> str:
         for name, e in by_peer.items():
             slope = ["", ""]
             if "gradient_error" in e:
-                slope = [f"{100 * e['gradient_error']:.2g} %", f"{e['gradient_cosine']:.4f}"]
+                slope = [f"{100 * e['gradient_error']:.1f} %", f"{e['gradient_cosine']:.4f}"]
             rows.append([scene, name, f"{e['rmse']:.5f}", f"{e['mean_difference']:.6f}", *slope])
     header = ["scene", "renderer", "picture, rms", "mean", "pose derivative, error", "cosine"]
     return markdown(header, rows) if rows else ""

@@ -255,7 +255,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
         axis.set_xscale("log")
         axis.set_xlabel(f"ms, {report['size']}² pixels")
         axis.set_title(scene)
-    axes[0, -1].legend()
+    axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
