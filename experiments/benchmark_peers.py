@@ -19,7 +19,8 @@ diffren and jaxrenderer need another version of JAX than diffrast, PyTorch3D is 
 `EARLIER` holds what they once took on such a machine (two cores, no GPU).
 
 Written to `--out`: `benchmark_peers.json`, `.md` (the tables) and `.png` (times over sizes).
-Expected: diffrast's derivative is the most exact one; see the README for times. A full run takes
+Expected: diffrast's pictures are the most exact ones, and its derivative that of the spheres; see
+the README for times. A full run takes
 half an hour on two cores, most of it compilation.
 """
 
