@@ -20,8 +20,7 @@ diffren and jaxrenderer need another version of JAX than diffrast, PyTorch3D is 
 
 Written to `--out`: `benchmark_peers.json`, `.md` (the tables) and `.png` (times over sizes).
 Expected: diffrast's pictures are the most exact ones, and its derivative that of the spheres; see
-the README for times. A full run takes
-half an hour on two cores, most of it compilation.
+the README for times. A full run takes half an hour to an hour on two cores, most of it compilation.
 """
 
 import argparse
