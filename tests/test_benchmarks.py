@@ -1,0 +1,192 @@
+"""The benchmarks, at tiny size: what they check, measure and write."""
+
+import json
+import sys
+
+import benchmark_features
+import benchmark_peers
+import benchmark_scaling
+import benchmark_stages
+import exactness
+import numpy as np
+import peers
+import pytest
+import timing
+
+SPHERE = "sphere, 5,120 faces"
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
+def read(folder, name):
+    assert (folder / f"{name}.png").is_file()
+    assert (folder / f"{name}.md").read_text().startswith("| ")
+    return json.loads((folder / f"{name}.json").read_text())
+
+
+# Peers --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def task():
+    return benchmark_peers.tasks(32)[SPHERE]
+
+
+@pytest.fixture(scope="module")
+def own(task):
+    return peers.DiffrastInterior(task)
+
+
+class Absent(peers.Peer):
+    name = "absent"
+
+    def __init__(self, task):
+        raise peers.MissingPeerError("absent needs what is not there")
+
+
+def test_peers_are_timed_and_compared(tmp_path, monkeypatch, own):
+    class Own(peers.Peer):  # compiled already
+        name = "diffrast"
+        image, gradient = staticmethod(own.image), staticmethod(own.gradient)
+
+    class Twin(Own):
+        name = "twin"
+
+    monkeypatch.setattr(peers, "DiffrastInterior", lambda task: own)
+    report = benchmark_peers.run(
+        tmp_path,
+        sizes=(32,),
+        only=[SPHERE],
+        repeats=1,
+        exact_size=32,
+        samples=16,
+        which=(Own, Twin, Absent),
+    )
+    cell = report["times"][SPHERE]["32"]
+    assert set(cell) == {"diffrast", "twin"}
+    ratios = report["speed"]["best_peer_over_ours"][f"{SPHERE}, 32"]
+    assert ratios["both_ms"] == cell["twin"]["both_ms"] / cell["diffrast"]["both_ms"]
+    assert report["speed"]["geometric_mean"] == pytest.approx(ratios)
+    errors = report["errors"][SPHERE]["diffrast"]
+    assert errors == report["errors"][SPHERE]["twin"]
+    assert errors["rmse"] < 0.05
+    assert 0 < errors["gradient_error"] < 1  # jagged: the outline's part is missing
+    assert report["missing"] == {"absent": "absent needs what is not there"}
+    assert read(tmp_path, "benchmark_peers")["missing"] == report["missing"]
+    assert "Missing: absent needs" in benchmark_peers.tables(report)
+
+
+@pytest.mark.parametrize(
+    ("kind", "module"),
+    [
+        (peers.Deodr, "deodr.differentiable_renderer"),
+        (peers.Mitsuba, "mitsuba"),
+        (peers.Llvmpipe, "moderngl"),
+    ],
+)
+def test_a_peer_that_is_not_installed_says_what_to_install(kind, module, task, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(peers.MissingPeerError, match=r"install diffrast\[peers\]"):
+        kind(task)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # their own
+@pytest.mark.parametrize("kind", peers.PEERS)
+def test_an_installed_peer_draws_the_same_picture(kind, task, own):
+    try:
+        peer = kind(task)
+    except peers.MissingPeerError as missing:
+        pytest.skip(str(missing))
+    expected = own.image() if kind.shading == "phong" else peers.DiffrastGouraud(task).image()
+    benchmark_peers.check_picture(peer, peers.in_floats(peer.image()), expected)
+    if kind is peers.Mitsuba:  # the same derivative as ours without edges
+        target = np.roll(expected, 2, axis=1)
+        np.testing.assert_allclose(peer.gradient(target), own.gradient(target), rtol=0.02, atol=0.1)
+
+
+def test_another_picture_is_not_timed(own):
+    image = own.image()
+    benchmark_peers.check_picture(own, image, image)
+    for other in (np.roll(image, 1, axis=0), image[:, :, ::-1], 0 * image):
+        with pytest.raises(AssertionError, match="diffrast, no edges draws another picture"):
+            benchmark_peers.check_picture(own, other, image)
+
+
+def test_pose_steps_move_the_mesh_by_a_pixel(task):
+    clip = np.diag([task.focal, task.focal])
+    view = np.asarray(task.camera.view, np.float64)
+    eye = np.asarray(task.mesh.vertices, np.float64) @ view[:3, :3].T + view[:3, 3]
+
+    def pixels(points):
+        return task.size / 2 * (points[:, :2] / -points[:, 2:]) @ clip
+
+    for i, step in enumerate(exactness.pose_steps(task)):
+        axis = np.eye(3)[i % 3]
+        moved = eye + 1e-4 * step * (np.cross(axis, eye) if i < 3 else axis)
+        distance = np.linalg.norm(pixels(moved) - pixels(eye), axis=1)
+        np.testing.assert_allclose(np.sqrt((distance**2).mean()), 1e-4, rtol=1e-3)
+
+
+# The others ---------------------------------------------------------------------------------------
+
+
+def test_stages_have_times_and_bounds(tmp_path, monkeypatch):
+    chosen = ("vertices to clip space", "face ids", "normals and positions")
+    every = benchmark_stages.stages
+
+    def few(*arguments):
+        found = every(*arguments)
+        assert set(chosen) < set(found)
+        return {name: found[name] for name in chosen}
+
+    monkeypatch.setattr(benchmark_stages, "stages", few)
+    monkeypatch.setattr(benchmark_stages, "cast", lambda *arguments: ((), ()))
+    benchmark_stages.run(tmp_path, size=32, repeats=1, only=[SPHERE])
+    found = read(tmp_path, "benchmark_stages")["scenes"][SPHERE]
+    for stage in found.values():
+        assert stage["ratio"] == pytest.approx(stage["ms"] / stage["bound_ms"], rel=1e-4)
+        assert stage["bound_ms"] > 0
+    assert found["face ids"]["both_ms"] is None
+    assert found["normals and positions"]["both_ms"] > 0
+
+
+def test_growth_is_fitted(tmp_path):
+    counts = {"views": (1, 2), "parameters": (3, 6)}
+    report = benchmark_scaling.run(tmp_path, size=16, repeats=1, counts=counts)
+    assert read(tmp_path, "benchmark_scaling")["growth"]["views"]["picture"]["counts"] == [1, 2]
+    assert set(report["growth"]["parameters"]) == {"derivative"}
+    assert "| views | picture | 1 to 2 |" in benchmark_scaling.table(report)
+
+
+def test_the_exponent_is_that_of_a_power():
+    sizes = np.array([1.0, 10, 300, 5000])
+    assert timing.exponent(sizes, 3 * sizes**1.5) == pytest.approx(1.5)
+
+
+def test_jobs_take_turns():
+    calls = []
+    times = timing.minimum_times({name: lambda n=name: calls.append(n) for name in "ab"}, 2)
+    assert "".join(calls) == "ab" + "ab" * 2  # once to compile
+    assert all(0 <= t < 100 for t in times.values())
+
+
+def test_features_are_compared_with_the_plain_scene(tmp_path, monkeypatch):
+    every = benchmark_features.variants()
+    assert {variant.base for variant in every.values()} <= set(every)
+    unlit = {"shading": "unlit"}  # compiles in half the time
+    few = {
+        "plain": benchmark_features.Variant(settings=unlit),
+        "culled": benchmark_features.Variant(settings=unlit | {"cull_backfaces": True}),
+    }
+    monkeypatch.setattr(benchmark_features, "variants", lambda: few)
+    report = benchmark_features.run(tmp_path, size=24, repeats=1)
+    found = read(tmp_path, "benchmark_features")["features"]
+    assert found["plain"]["forward_added_ms"] == 0
+    culled, plain = (report["features"][name]["both_ms"] for name in ("culled", "plain"))
+    assert report["features"]["culled"]["both_share"] == pytest.approx(culled / plain)
+
+
+def test_a_wrong_picture_of_a_feature_is_not_timed():
+    variant = benchmark_features.Variant()
+    with pytest.raises(AssertionError, match="plain: the picture is wrong"):
+        benchmark_features.check("plain", variant, np.zeros((4, 4, 3)))

@@ -1,0 +1,145 @@
+"""What the programs hold: nothing for what a scene lacks, nothing for what is not differentiated.
+
+That specular terms, positions, texture coordinates, edges and shadows leave no trace where they are
+absent is counted next to each of them (`test_render.py`, `test_textured_scenes.py`,
+`test_edges.py`, `test_shadow.py`); here it is what the parts of a scene have in common.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from scenes import settings
+from test_render import SHINY, VERTICES, ball, operations, times
+
+import diffrast as dr
+
+SUN = dr.DirectionalLight(direction=(0.3, -1.0, -1.0), ambient=(0.1, 0.1, 0.1))
+TEXTURE = dr.Texture(np.random.default_rng(0).uniform(size=(8, 8, 3)))
+CAMERA = scenes.perspective()
+
+
+def scene(material=None, light=SUN):
+    return dr.Scene(
+        objects=[ball(dr.Material(**(SHINY if material is None else material)))], lights=[light]
+    )
+
+
+def loops(given, options):
+    return times(operations(dr.render, given, CAMERA, options), "while")
+
+
+def gradient(given, part, options):
+    """The derivative of a loss by one part of the scene, as a program and its argument.
+
+    Everything else is an argument too: no constants, which the compiler could fold.
+    """
+
+    def loss(value, given, camera):
+        item = given.objects[0]
+        if part == "camera":
+            camera = value
+        elif part in ("lights", "background"):
+            given = dataclasses.replace(given, **{part: value})
+        else:
+            if part == "texels":
+                material = dataclasses.replace(item.material, texture=value)
+                item = dataclasses.replace(item, material=material)
+            else:
+                item = dataclasses.replace(item, **{part: value})
+            given = dataclasses.replace(given, objects=[item])
+        return jnp.sum(dr.render(given, camera, options) ** 2)
+
+    item = given.objects[0]
+    value = {
+        "camera": CAMERA,
+        "lights": given.lights,
+        "background": given.background,
+        "material": item.material,
+        "texels": item.material.texture,
+        "transform": item.transform,
+    }[part]
+    return jax.jit(jax.grad(loss)), (value, given, CAMERA)
+
+
+def to_vertices(given, part, options):
+    """How many columns of the vertices' values a derivative adds up, from the pixels' values."""
+    program, arguments = gradient(given, part, options)
+    return operations(program, *arguments)["scatter", f"{VERTICES}xf32"]
+
+
+# Absent features ----------------------------------------------------------------------------------
+
+
+def test_each_feature_has_its_loops_and_its_absence_none():
+    plain = loops(scene(), settings())
+    assert loops(scene(material={}), settings()) == plain
+    assert loops(scene(), settings(shading="unlit")) == plain
+    shadowed = scene(light=dataclasses.replace(SUN, shadow=dr.Shadow(resolution=16)))
+    assert loops(shadowed, settings()) > plain  # the light's own picture
+    assert loops(shadowed, settings(shading="unlit")) == plain
+    assert loops(scene(), settings(antialias=True)) > plain  # edges are searched
+    assert loops(scene(material={"texture": TEXTURE}), settings()) == plain
+
+
+def test_a_light_without_an_ambient_part_adds_no_operation_for_it():
+    dark = dataclasses.replace(SUN, ambient=None)
+    with_it, without = (
+        operations(dr.render, scene({}, light), CAMERA, settings()) for light in (SUN, dark)
+    )
+    assert times(without, "multiply") < times(with_it, "multiply")
+    assert times(without, "add") < times(with_it, "add")
+
+
+# Derivatives --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("part", ["lights", "background", "material", "texels"])
+def test_what_does_not_move_has_no_part_for_the_geometry(part, antialias):
+    material = {"texture": TEXTURE} if part == "texels" else SHINY
+    assert to_vertices(scene(material), part, settings(antialias=antialias)) == 0
+
+
+# x, y, w of three corners each; then normals and positions, where the colours depend on them.
+@pytest.mark.parametrize(
+    ("part", "material", "columns"),
+    [
+        ("camera", {}, 9),
+        ("camera", SHINY, 9),  # the eye moves against fixed points: none of theirs
+        ("transform", {}, 9 + 9),
+        ("transform", SHINY, 9 + 9 + 9),
+    ],
+)
+def test_a_motion_adds_up_only_what_it_moves(part, material, columns):
+    assert to_vertices(scene(material), part, settings()) == columns
+
+
+@pytest.mark.parametrize("part", ["lights", "camera", "transform"])
+def test_a_derivative_draws_the_scene_once(part):
+    program, arguments = gradient(scene(), part, settings())
+    assert times(operations(program, *arguments), "while") == loops(scene(), settings())
+
+
+# Other values -------------------------------------------------------------------------------------
+
+
+def test_a_derivative_is_not_traced_again_for_other_values():
+    traced = []
+    start = dataclasses.replace(scene({"texture": TEXTURE}), background=(0.1, 0.2, 0.3))
+
+    @jax.jit
+    @jax.grad
+    def program(camera, given):
+        traced.append(camera)
+        return jnp.sum(dr.render(given, camera, settings(shading="unlit")))
+
+    program(CAMERA, start)
+    other = jax.tree.map(lambda x: x * 1.01 if jnp.issubdtype(x.dtype, jnp.floating) else x, start)
+    for given in (start, other, dataclasses.replace(start, background=np.zeros(3))):
+        for camera in (CAMERA, scenes.perspective(eye=(0.0, 1.0, 5.0)), scenes.parallel()):
+            assert np.isfinite(program(camera, given).view).all()
+    assert len(traced) == 1
