@@ -3,7 +3,7 @@
     python experiments/benchmark_stages.py [--size 512] [--repeats 30]
 
 Each stage runs alone, on arrays that lie in memory, as the renderer runs it: vertices to clip
-space, face ids, barycentrics, interpolation of normals and positions, Phong shading with a
+space, face ids, barycentrics, the same with normals and positions, Phong shading with a
 highlight, edges, a shadow map and its look-up; and each that is differentiable once more with its
 pull-back of a random cotangent ("both"). A stage's bound is the larger of two times: the bytes that
 it must read and write once over the speed at which the same compiler copies a picture, and its
@@ -29,10 +29,9 @@ from common import pyplot, save_json
 from timing import compiled, markdown, minimum_times
 
 import diffrast as dr
-from diffrast.geometry import clip_positions, visible_points, world_geometry
-from diffrast.interpolate import interpolate_columns
+from diffrast.geometry import clip_positions, draw, visible_points, world_geometry
 from diffrast.raster.coverage import faces_and_depths, visible_faces
-from diffrast.raster.fragments import evaluate_fragments
+from diffrast.raster.evaluate import Drawn, all_pixels, evaluate
 from diffrast.shade import Reflectance, Surface, phong
 from diffrast.shadows import cast, receive
 
@@ -68,7 +67,7 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
     scene = dr.Scene(objects=[dr.Object(mesh, material)], lights=[light])
     geometry = world_geometry(scene, "phong")
     clip = clip_positions(geometry, camera)
-    points = visible_points(geometry, clip, size, size, False)
+    points = visible_points(*draw(geometry, camera, clip, size, size, cull_backfaces=False))
     fragments = dr.rasterize(clip, mesh.faces, height=size, width=size)
     covered = check(clip, mesh.faces, fragments) * size**2
     vertices, faces, pixels = mesh.vertices.shape[0], mesh.faces.shape[0], float(size**2)
@@ -76,11 +75,10 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
     shadows, _ = jax.jit(cast)(scene.lights, geometry, points)
     map_clip = dr.world_to_clip(camera, mesh.vertices)
 
-    def interpolate(attributes: list[jax.Array], barycentrics: list[jax.Array]) -> list[jax.Array]:
-        return interpolate_columns(attributes, mesh.faces, points.face, barycentrics)
+    def see(p: jax.Array, face: jax.Array, attributes: tuple[jax.Array, ...]) -> Any:
+        return evaluate(Drawn(p, mesh.faces, attributes), all_pixels(face, p.dtype))
 
-    attributes = [*geometry.normals.T, *geometry.positions.T]
-    columns = interpolate(attributes, points.barycentrics)
+    columns = [*points.normal, *points.position]
 
     def shade(columns: list[jax.Array], to_viewer: list[jax.Array]) -> list[jax.Array]:
         reflectance = Reflectance(
@@ -115,17 +113,17 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
             60 * faces + 10 * tested,
         ),
         "barycentrics, 1/w": Stage(
-            lambda p, face: evaluate_fragments(p, mesh.faces, face),
+            lambda p, face: see(p, face, ())[:2],
             (clip, points.face),
             FLOAT * (4 * vertices + 3 * faces + 5 * pixels),
             30 * covered,
             1,
         ),
-        "normals and positions": Stage(
-            interpolate,
-            (attributes, points.barycentrics),
-            FLOAT * (6 * vertices + 3 * faces + 10 * pixels),
-            18 * covered,
+        "with normals and positions": Stage(
+            lambda attributes, p, face: see(p, face, attributes),
+            ((geometry.normals, geometry.positions), clip, points.face),
+            FLOAT * (10 * vertices + 3 * faces + 11 * pixels),
+            48 * covered,
             2,
         ),
         "Phong shading": Stage(

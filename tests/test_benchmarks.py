@@ -131,7 +131,7 @@ def test_pose_steps_move_the_mesh_by_a_pixel(task):
 
 
 def test_stages_have_times_and_bounds(tmp_path, monkeypatch):
-    chosen = ("vertices to clip space", "face ids", "normals and positions")
+    chosen = ("vertices to clip space", "face ids", "with normals and positions")
     every = benchmark_stages.stages
 
     def few(*arguments):
@@ -147,7 +147,7 @@ def test_stages_have_times_and_bounds(tmp_path, monkeypatch):
         assert stage["ratio"] == pytest.approx(stage["ms"] / stage["bound_ms"], rel=1e-4)
         assert stage["bound_ms"] > 0
     assert found["face ids"]["both_ms"] is None
-    assert found["normals and positions"]["both_ms"] > 0
+    assert found["with normals and positions"]["both_ms"] > 0
 
 
 def test_growth_is_fitted(tmp_path):
