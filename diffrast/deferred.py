@@ -24,6 +24,7 @@ from diffrast.shadows import Reached
 
 RUN = 32  # pixels
 RUNS_AT_ONCE = 512
+LARGE = 1 << 17  # pixels: what smaller images need is fast to store
 
 
 class _Runs(NamedTuple):
@@ -58,7 +59,7 @@ def shade_covered(
         in_batches: whether derivatives of large images are.
     """
     inputs = data, drawn, face, reached
-    if not in_batches or face.size <= RUN * RUNS_AT_ONCE:
+    if not in_batches or face.size <= LARGE:
         return _in_one_go(shade, *inputs)
 
     @jax.custom_jvp

@@ -29,7 +29,7 @@ def shade(color, points, reached):
 
 
 def colors(params):
-    """Of an image whose pixels are shaded in batches if `deferred.RUNS_AT_ONCE` is small."""
+    """Of an image whose pixels are shaded in batches if `deferred.LARGE` is small."""
     eye = params["eye"]
     camera = dr.Camera.perspective(
         eye=eye, target=(0, 0, 0), up=(0, 1, 0), fov_y=0.7, near=0.1, far=10
@@ -58,6 +58,7 @@ def derivatives(params):
 
 @pytest.fixture
 def small_batches(monkeypatch):
+    monkeypatch.setattr(deferred, "LARGE", 0)
     monkeypatch.setattr(deferred, "RUNS_AT_ONCE", 4)
 
 
