@@ -7,7 +7,7 @@ cache. A reverse pass goes through the batches again and begins by repeating eac
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from diffrast._selection import compacted
 from diffrast._varying import varying_alike
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
-from diffrast.raster.evaluate import Drawn, Pixels, all_pixels, carry
+from diffrast.raster.evaluate import Drawn, all_pixels, carry, pixels_at
 from diffrast.shadows import Reached
 
 RUN = 32  # pixels
@@ -35,12 +35,21 @@ class _Runs(NamedTuple):
     total: Int[Array, ""]  # that hold something
 
 
-Data = TypeVar("Data")
+class _Inputs(NamedTuple):
+    """Arguments of `shade_covered`."""
+
+    data: Any
+    drawn: Drawn
+    face: Int[Array, "height width"]
+    reached: Reached
+
+
+Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
 
 def shade_covered(
-    shade: Callable[[Data, Points, Reached], Columns],
-    data: Data,
+    shade: Shade,
+    data: Any,
     drawn: Drawn,
     face: Int[Array, "height width"],
     reached: Reached,
@@ -50,7 +59,7 @@ def shade_covered(
     """Colours of the pixels that see a face, in whole images; of no meaning elsewhere.
 
     Args:
-        shade: colours of points, one array a channel.
+        shade: colours of points, one array a channel; its first argument is `data`.
         data: a tree of all arrays that it uses. Differentiated in batches, each array costs a pass
             over it for every batch.
         drawn: what is drawn.
@@ -58,13 +67,13 @@ def shade_covered(
         reached: by each light; images.
         in_batches: whether derivatives of large images are.
     """
-    inputs = data, drawn, face, reached
+    inputs = _Inputs(data, drawn, face, reached)
     if not in_batches or face.size <= LARGE:
-        return _in_one_go(shade, *inputs)
+        return _in_one_go(shade, inputs)
 
     @jax.custom_jvp
-    def colors(inputs: Any) -> Columns:
-        return _in_one_go(shade, *inputs)
+    def colors(inputs: _Inputs) -> Columns:
+        return _in_one_go(shade, inputs)
 
     def derivative(primals: Any, tangents: Any) -> tuple[Columns, Columns]:
         leaves, tree = jax.tree.flatten(primals[0])
@@ -74,7 +83,7 @@ def shade_covered(
         def of_moving(*values: Array) -> Columns:
             given = dict(zip(moving, values, strict=True))
             parts = [given.get(i, leaf) for i, leaf in enumerate(leaves)]
-            return _in_batches(shade, *jax.tree.unflatten(tree, parts))
+            return _in_batches(shade, jax.tree.unflatten(tree, parts))
 
         return jax.jvp(of_moving, [leaves[i] for i in moving], [changes[i] for i in moving])
 
@@ -82,35 +91,18 @@ def shade_covered(
     return colors(inputs)
 
 
-def _in_one_go(
-    shade: Callable[[Data, Points, Reached], Columns],
-    data: Data,
-    drawn: Drawn,
-    face: Array,
-    reached: Reached,
-) -> Columns:
-    return shade(data, points_at(drawn, all_pixels(face, drawn.positions_clip.dtype)), reached)
+def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
+    pixels = all_pixels(inputs.face, inputs.drawn.positions_clip.dtype)
+    return shade(inputs.data, points_at(inputs.drawn, pixels), inputs.reached)
 
 
-def _in_batches(
-    shade: Callable[[Data, Points, Reached], Columns],
-    data: Data,
-    drawn: Drawn,
-    face: Array,
-    reached: Reached,
-) -> Columns:
+def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
+    data, drawn, face, reached = inputs
     dtype = drawn.positions_clip.dtype
     runs = _covered_runs(face)
-    width, height = face.shape[1], face.shape[0]
-    number = runs.chosen[:, None] * RUN + jnp.arange(RUN)
-    column, row = number % width, number // width
-    pixels = Pixels(
-        _batched(_taken(face, runs, -1)),
-        _batched((2 * column + 1 - width).astype(dtype)),
-        _batched((height - 1 - 2 * row).astype(dtype)),
-        jnp.asarray(height, dtype),
-        jnp.asarray(width, dtype),
-    )
+    number = _batched(runs.chosen[:, None] * RUN + jnp.arange(RUN))
+    row, column = number // face.shape[1], number % face.shape[1]
+    pixels = pixels_at(_batched(_taken(face, runs, -1)), row, column, face.shape, dtype)
     parts = tuple(None if part is None else _batched(_taken(part, runs, 0)) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from diffrast._check import ArrayInput, float_array, index_array, positive_int
 from diffrast._stored import assemble
 from diffrast.raster import Fragments
-from diffrast.raster.evaluate import corners_at
+from diffrast.raster.evaluate import blend, corners_at
 
 
 def interpolate(
@@ -57,9 +57,8 @@ def interpolate_columns(
     barycentrics: list[Float[Array, "*size"]],
 ) -> list[Float[Array, "*size"]]:
     """Interpolate attributes kept apart, which XLA fuses far better than stacked ones."""
-    b0, b1, b2 = barycentrics
-    i0, i1, i2 = corners_at(faces, face)
-    return [b0 * column[i0] + b1 * column[i1] + b2 * column[i2] for column in columns]
+    corners = corners_at(faces, face)
+    return [blend(barycentrics, [column[corner] for corner in corners]) for column in columns]
 
 
 def screen_derivatives(

@@ -15,7 +15,6 @@ every pixel is shaded all the same, but in the derivative of pictures of more th
 Written to `--out`: `benchmark_features.json`, `.md` and `.png`.
 """
 
-import argparse
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,8 +23,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, save_json
-from timing import compiled, markdown, minimum_times
+from common import pyplot
+from timing import benchmark_options, compiled, markdown, minimum_times, write_report
 
 import diffrast as dr
 
@@ -146,9 +145,7 @@ def run(
             result[f"{kind}_added_ms"] = times[name, kind] - times[variant.base, kind]
             result[f"{kind}_share"] = times[name, kind] / times[variant.base, kind]
         report["features"][name] = result
-    save_json(out / "benchmark_features.json", report)
-    (out / "benchmark_features.md").write_text(table(report) + "\n")
-    plot(report, out / "benchmark_features.png")
+    write_report(out, "benchmark_features", report, table, plot)
     return report
 
 
@@ -182,14 +179,9 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/benchmark_features"))
+    parser = benchmark_options(__doc__, "benchmark_features", repeats=30)
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the picture")
-    parser.add_argument("--repeats", type=int, default=30, help="timed runs of each")
     parser.add_argument("--only", nargs="+", metavar="FEATURE", help="and what it is compared with")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
 

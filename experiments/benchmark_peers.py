@@ -23,7 +23,6 @@ Expected: diffrast's pictures are the most exact ones, and its derivative that o
 the README for times. A full run takes half an hour to an hour on two cores, most of it compilation.
 """
 
-import argparse
 import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -35,7 +34,7 @@ from benchmark_raster import scenes as benchmark_scenes
 from common import pyplot, save_json
 from exactness import qualities
 from peers import Peer, Task, in_floats
-from timing import markdown, minimum_times, three_digits
+from timing import benchmark_options, markdown, minimum_times, three_digits
 
 import diffrast as dr
 
@@ -283,9 +282,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(
         1, len(times), figsize=(4 * len(times) + 2, 4), squeeze=False, sharey=True
     )
-    names = list(
-        dict.fromkeys(n for by_size in times.values() for c in by_size.values() for n in c)
-    )
+    names = renderers(times)
     colors = {name: f"C{i}" for i, name in enumerate([*names, "diffren splat"])}
     for axis, (scene, by_size) in zip(axes[0], times.items(), strict=True):
         sizes = [int(size) for size in by_size]
@@ -320,17 +317,12 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/benchmark_peers"))
+    parser = benchmark_options(__doc__, "benchmark_peers", repeats=10)
     parser.add_argument("--sizes", type=int, nargs="*", default=[256, 512, 1024], metavar="SIZE")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="names of scenes")
-    parser.add_argument("--repeats", type=int, default=10, help="timed runs of each")
     parser.add_argument("--exact-size", type=int, default=256, help="0: compare no errors")
     parser.add_argument("--samples", type=int, default=256, help="a pixel of exact pictures")
     parser.add_argument("--quick", action="store_true", help="one scene, one small size")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     if options.pop("quick"):
         options |= {"sizes": [64], "only": ["sphere, 5,120 faces"], "repeats": 3}

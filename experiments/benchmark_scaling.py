@@ -15,7 +15,6 @@ Written to `--out`: `benchmark_scaling.json`, `.md` and `.png`. Fifteen minutes 
 of it compilation.
 """
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import pyplot, save_json
-from timing import compiled, exponent, markdown, minimum_times
+from common import pyplot
+from timing import benchmark_options, compiled, exponent, markdown, minimum_times, write_report
 
 import diffrast as dr
 
@@ -165,9 +164,7 @@ def run(
             for what, lines in found.items()
         },
     }
-    save_json(out / "benchmark_scaling.json", report)
-    (out / "benchmark_scaling.md").write_text(table(report) + "\n")
-    plot(report, out / "benchmark_scaling.png")
+    write_report(out, "benchmark_scaling", report, table, plot)
     return report
 
 
@@ -210,14 +207,9 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/benchmark_scaling"))
+    parser = benchmark_options(__doc__, "benchmark_scaling", repeats=10)
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the pictures")
-    parser.add_argument("--repeats", type=int, default=10, help="timed runs of each")
     parser.add_argument("--quick", action="store_true", help="few and small")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     if options.pop("quick"):
         options |= {"counts": QUICK, "size": 64}

@@ -16,7 +16,6 @@ where work is lost.
 Written to `--out`: `benchmark_stages.json`, `.md` and `.png`.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark_raster import check, overdraw, scenes
-from common import pyplot, save_json
-from timing import compiled, markdown, minimum_times
+from common import pyplot
+from timing import benchmark_options, compiled, markdown, minimum_times, write_report
 
 import diffrast as dr
 from diffrast.geometry import clip_positions, draw, visible_points, world_geometry
@@ -214,9 +213,7 @@ def run(
                 "bound_by": "memory" if bound == memory else "arithmetic",
                 "ratio": times[key, "alone"] / bound,
             }
-    save_json(out / "benchmark_stages.json", report)
-    (out / "benchmark_stages.md").write_text(table(report) + "\n")
-    plot(report, out / "benchmark_stages.png")
+    write_report(out, "benchmark_stages", report, table, plot)
     return report
 
 
@@ -259,14 +256,9 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/benchmark_stages"))
+    parser = benchmark_options(__doc__, "benchmark_stages", repeats=30)
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the picture")
-    parser.add_argument("--repeats", type=int, default=30, help="timed runs of each")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="names of scenes")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = vars(parser.parse_args())
     print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
 

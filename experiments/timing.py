@@ -1,14 +1,30 @@
-"""What the benchmarks share: fair times, and tables."""
+"""What the benchmarks share: options, fair times, tables and files."""
 
+import argparse
 import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from common import save_json
 
 Key = TypeVar("Key", bound=Hashable)
+
+
+def benchmark_options(
+    description: str | None, out: str, *, repeats: int
+) -> argparse.ArgumentParser:
+    """Options of every benchmark."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=Path("results") / out)
+    parser.add_argument("--repeats", type=int, default=repeats, help="timed runs of each")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    return parser
 
 
 def minimum_times(
@@ -54,3 +70,16 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     cells = [[three_digits(c) if isinstance(c, float) else str(c) for c in row] for row in rows]
     lines = [list(header), ["---"] * len(header), *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def write_report(
+    out: Path,
+    name: str,
+    report: dict[str, Any],
+    table: Callable[[dict[str, Any]], str],
+    plot: Callable[[dict[str, Any], Path], None],
+) -> None:
+    """Write a report as JSON, its table and its plot."""
+    save_json(out / f"{name}.json", report)
+    (out / f"{name}.md").write_text(table(report) + "\n")
+    plot(report, out / f"{name}.png")

@@ -274,16 +274,9 @@ def instead_of_first(waiting: Waiting, pieces: Pieces) -> Waiting:
     """What waits if only those of others that exist take the place of the `first_ones`."""
     pieces, count = gathered(pieces)
     others = jax.tree.map(lambda column: column[..., PIECES_AT_ONCE:], waiting.pieces)
-    rest = behind(Waiting(waiting.pieces, count), others, waiting.total - PIECES_AT_ONCE)
-    place = jnp.arange(waiting.pieces.exists.size)
-    room = [(0, CUT_AT_ONCE)]
-
-    def put(new: Array, old: Array) -> Array:
-        new = jnp.pad(new, [(0, 0)] * (new.ndim - 1) + room)
-        return jnp.where(place < count, new, old)
-
-    columns = jax.tree.map(put, pieces, rest.pieces)
-    return Waiting(columns, jnp.maximum(rest.total, count))
+    room = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), pieces, others)
+    rest = jnp.maximum(waiting.total - PIECES_AT_ONCE, 0)
+    return behind(Waiting(room, count), others, rest)
 
 
 def gathered(pieces: Pieces) -> tuple[Pieces, Int[Array, ""]]:

@@ -86,9 +86,16 @@ class _Seen(NamedTuple):
 
 def all_pixels(face: Int[Array, "height width"], dtype: jnp.dtype) -> Pixels:
     """Those of a whole image."""
-    height, width = face.shape
-    x = (2 * jnp.arange(width) + 1 - width).astype(dtype)[None, :]
-    y = (height - 1 - 2 * jnp.arange(height)).astype(dtype)[:, None]
+    rows, columns = (jnp.arange(size) for size in face.shape)
+    return pixels_at(face, rows[:, None], columns[None, :], face.shape, dtype)
+
+
+def pixels_at(
+    face: Array, row: Array, column: Array, shape: tuple[int, ...], dtype: jnp.dtype
+) -> Pixels:
+    """Pixels in these rows and columns of an image of this height and width."""
+    height, width = shape
+    x, y = (2 * column + 1 - width).astype(dtype), (height - 1 - 2 * row).astype(dtype)
     return Pixels(face, x, y, jnp.asarray(height, dtype), jnp.asarray(width, dtype))
 
 
@@ -121,7 +128,7 @@ def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
     def change_of(column: Array) -> Array:
         corners = [stored(column[faces[:, j]], witness) for j in range(3)]
         at = [corner.at[visible].get(mode="fill", fill_value=0) for corner in corners]
-        return reduce(add, (b * c for b, c in zip(barycentrics, at, strict=True))) + zero
+        return blend(barycentrics, at) + zero
 
     def changes(values: Any, zeros: Columns, columns: tuple[int, ...] | range) -> Any:
         if isinstance(values, SymbolicZero):
@@ -141,9 +148,8 @@ def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
 def _evaluate(drawn: Drawn, pixels: Pixels, carried: Carried) -> Evaluated:
     del carried  # which is zero
     seen = _see(drawn, pixels)
-    b0, b1, b2 = seen.barycentrics
     columns = tuple(
-        [b0 * first + b1 * second + b2 * third for first, second, third in at_corners]
+        [blend(seen.barycentrics, corners) for corners in at_corners]
         for at_corners in _at_corners(drawn, seen)
     )
     return Evaluated(seen.barycentrics, seen.inverse_depth, columns)
@@ -190,7 +196,7 @@ def _see(drawn: Drawn, pixels: Pixels) -> _Seen:
     valid = (pixels.face >= 0) & (total != 0)
     inverse_total = jnp.where(valid, 1, 0) / jnp.where(valid, total, 1)
     barycentrics = stored([e * inverse_total for e in edge])
-    depth = barycentrics[0] * w[0] + barycentrics[1] * w[1] + barycentrics[2] * w[2]
+    depth = blend(barycentrics, w)
     positive = valid & (depth > 0)
     inverse_depth = jnp.where(positive, 1 / unit, 0) / jnp.where(positive, depth, 1)
     return _Seen(corners, x, y, w, unit, inverse_total, barycentrics, inverse_depth)
@@ -228,6 +234,11 @@ def _slide(seen: _Seen, pixels: Pixels, motion: Columns) -> tuple[Array, Array]:
     u, v = stored((u, v), seen.inverse_depth)
     x, y = seen.x, seen.y
     return (y[2] - y[0]) * u + (x[0] - x[2]) * v, (y[0] - y[1]) * u + (x[1] - x[0]) * v
+
+
+def blend(barycentrics: Columns, values: Columns) -> Array:
+    """The value on faces between those at their corners."""
+    return barycentrics[0] * values[0] + barycentrics[1] * values[1] + barycentrics[2] * values[2]
 
 
 def corners_at(faces: Int[Array, "F 3"], face: Int[Array, "*size"]) -> list[Int[Array, "*size"]]:
