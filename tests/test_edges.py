@@ -101,6 +101,19 @@ def test_bodies_that_lie_in_one_another_have_no_line_in_common():
     assert np.sum(one == 0) > 200
 
 
+def test_what_thin_faces_hide_shows_no_edge():
+    """The faces in front are so thin that the pixels beside the edge may see none of them."""
+    wall = dr.shapes.plane(8.0, 8.0, divisions=(2, 130))
+    tilted = dr.linalg.translation((0.0, 0.0, -0.1)) @ dr.linalg.rotation_z(0.05)
+    objects = [
+        dr.Object(wall, dr.Material(diffuse=(1.0, 1.0, 1.0))),
+        dr.Object(dr.shapes.plane(1.0, 1.0), dr.Material(diffuse=(0.0, 0.0, 0.0)), tilted),
+    ]
+    settings = dataclasses.replace(SETTINGS, shading="unlit")
+    image = dr.render(dr.Scene(objects=objects), camera((0.0, 0.0, 3.0)), settings)
+    np.testing.assert_allclose(image, 1.0, atol=1e-6)
+
+
 def test_no_piece_is_lost_however_few_records_there_are(seen):
     clip, face = seen
     color = jnp.asarray(np.random.default_rng(3).uniform(size=(len(MESH.faces) + 1, 3)))

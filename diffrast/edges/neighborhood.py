@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._stored import stored
 from diffrast.edges.planes import Table, corners_of, edge_values
 
-_STEPS = 8
+_STEPS = 64
 
 
 def picked(values: Array, index: Array) -> Array:
@@ -54,29 +54,36 @@ def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
 
 
 def walk(
-    face: Int[Array, " n"],
-    x: Float[Array, " n"],
-    y: Float[Array, " n"],
+    face: Int[Array, "*n"],
+    x: Float[Array, "*n"],
+    y: Float[Array, "*n"],
     faces: Int[Array, "F 3"],
     pixels: Table,
     neighbors: Int[Array, "F 3"],
     volume: Float[Array, " F"],
-) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
+) -> tuple[Int[Array, "*n"], Bool[Array, "*n"]]:
     """The faces that cover points, found from other faces on the way towards these.
 
-    From face to face across the edge beyond which the point lies; -1 if the surface ends before, or
+    From face to face across edges beyond which the point lies; -1 if the surface ends before, or
     turns away. Also whether the end of the way was reached.
     """
 
-    def step(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        face, there = state
-        values, _ = edge_values(corners_of(face, faces, pixels), x, y)
-        least = jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
-        side = jnp.where(values[0] == least, 0, jnp.where(values[1] == least, 1, 2))
-        following = neighbors[jnp.maximum(face, 0), side]
-        turns = volume[jnp.maximum(following, 0)] * jnp.sign(volume[jnp.maximum(face, 0)])
-        following = jnp.where((following >= 0) & (turns > 0), following, -1)
-        there = there | (face < 0) | (least >= 0)
-        return stored((jnp.where(there, face, following), there))
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        steps, face, there = state
+        values = jnp.stack(edge_values(corners_of(face, faces, pixels), x, y)[0])
+        known = jnp.maximum(face, 0)
+        beside = stored(neighbors.T[:, known])
+        goes_on = volume[jnp.maximum(beside, 0)] * jnp.sign(volume[known]) > 0
+        way = stored(jnp.where((beside >= 0) & goes_on, jnp.minimum(values, 0), 0))
+        best = (way < 0) & (way == jnp.min(way, axis=0))
+        following = jnp.max(jnp.where(best, beside, -1), axis=0)
+        there = there | (face < 0) | jnp.all(values >= 0, axis=0)
+        return steps + 1, *stored((jnp.where(there, face, following), there))
 
-    return lax.fori_loop(0, _STEPS, step, (face, face < 0))
+    def is_on_the_way(state: tuple[Array, Array, Array]) -> Array:
+        steps, _, there = state
+        return (steps < _STEPS) & ~jnp.all(there)
+
+    start = jnp.sum(face) & 0, face, face < 0
+    _, face, there = lax.while_loop(is_on_the_way, step, start)
+    return face, there

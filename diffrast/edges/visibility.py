@@ -166,7 +166,8 @@ def look(
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
-    offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
+    inside = stored(jnp.minimum(_BEFORE, thickness / 2))
+    offset = jnp.stack([-inside * out, _BEYOND * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
     values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
@@ -201,12 +202,11 @@ def look(
     found = fold & (nearest > 0)
     beyond = jnp.where(fold, jnp.where(found, picked(around, best), -1), other)
     beyond = stored(beyond)
-    x, y = stored(centre + middle + _BEYOND * out)
 
     # Pixels whose centres lie on either side. What the rasteriser shows of an edge that passes
     # through a centre tells on which side that is.
     to_right = -(middle[0] * normal[0] + middle[1] * normal[1])
-    depths = depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9])
+    depths = stored(depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9]))
     farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + FINE_TOLERANCE) < near))
     farther = (pictured[4] == beyond) | (fold & farther)
     wrong_side = fold & (pictured[4] >= 0) & (pictured[4] == other)
@@ -225,19 +225,28 @@ def look(
     above = tiny & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
-    # Where nothing is found behind, and the surface at the pixel beyond ends before, it is bare.
-    shown = stored(picked(pictured, beyond_look))
+    # Two walks over the surface: to the point just inside, from where a surface is seen that would
+    # hide the piece if it reached it; and where nothing is found behind, to the point just beyond,
+    # from what is seen there; if that ends before, the background is bare.
+    before = fold & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     search = fold & ~found
-    reached, there = walk(
-        jnp.where(search, shown, -1), x, y, faces, pixels, topology.neighbors, volume
-    )
-    reached = stored(jnp.where(search, reached, beyond))
-    values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
-    at_beyond = barycentrics(values)
-    lies = search & there & (reached >= 0) & (reached_depth <= near * (1 + FINE_TOLERANCE))
-    gap = search & there & (reached < 0) & (shown >= 0) & has_background
-    beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached, beyond)))
     bare = pictured < 0
+    shown = picked(pictured, beyond_look)
+    leave = jnp.stack([_seen_nearest(before, pictured, middle), jnp.where(search, shown, -1)])
+    distance = jnp.stack([-inside, jnp.full_like(inside, _BEYOND)])
+    aim = (centre + middle)[:, None] + distance * out[:, None]
+    leave, aim = stored((leave, aim))
+    reached, there = walk(leave, aim[0], aim[1], faces, pixels, topology.neighbors, volume)
+    arrives = there & (reached >= 0)
+    reached = stored(jnp.where(arrives | (leave >= 0), reached, beyond))
+    values, reached_depth = edge_values(corners_of(reached, faces, pixels), aim[0], aim[1])
+    foreign = (reached != own[0]) & (reached != own[1])
+    hides = stored(arrives & foreign & (reached_depth > near * (1 + FINE_TOLERANCE)))
+    visible = visible & ~hides[0] & ~hides[1]
+    lies = arrives[1] & ~hides[1]
+    gap = search & there[1] & (reached[1] < 0) & (shown >= 0) & has_background
+    at_beyond = barycentrics([value[1] for value in values])
+    beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached[1], beyond)))
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
@@ -289,6 +298,15 @@ def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Arra
     same = (face >= 0) & (patch == patches[jnp.maximum(face, 0)])
     first = first_row(same)
     return jnp.where(picked(same, look) | (first == 9), look, first)
+
+
+def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
+    """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
+    nine = jnp.arange(9)[:, None]
+    x, y = nine % 3 - 1 - point[0], nine // 3 - 1 - point[1]
+    distance = stored(jnp.where(mask, x * x + y * y, jnp.inf))
+    best = first_row(mask & (distance == jnp.min(distance, axis=0)))
+    return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
 
 
 def _thickness(
