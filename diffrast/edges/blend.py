@@ -10,6 +10,7 @@ which adds up exactly over the pieces of any outline. To first order dS is minus
 times the motion of its middle: linear in the positions, without a singularity.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._selection import over_batches, prefix_sum
 from diffrast._stored import stored
 from diffrast._topology import Topology
+from diffrast.edges.neighborhood import blocks_with_background
 from diffrast.edges.pieces import (
     CUT_AT_ONCE,
     EDGES_AT_ONCE,
@@ -48,6 +50,7 @@ from diffrast.edges.piercing import (
     keep_near_crossings,
     line_of,
 )
+from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look, uncovered
@@ -155,7 +158,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
         volume = stored(jnp.where(front, volume, 0))
     order, edge_count = choose_edges(edges, volume, view.apart)
-    has_background = jnp.any(view.face_image < 0)
+    bare_blocks = blocks_with_background(view.face_image)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
@@ -185,7 +188,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
                 view.topology,
                 volume,
                 view.face_image,
-                has_background,
+                bare_blocks,
             )
             total = _with_pieces(state[2], view, method, segments, pieces, found, first)
             return n, instead_of_first(waiting, left), total
@@ -318,11 +321,11 @@ def _with_pieces(
         jump = behind - front
         value = area[:, None] * jump
     else:
-        points = found.front[:2], found.beyond[:2], rim.bend, rim.far
-        front, beyond, bend, far = _shade(view, method, *points)
+        points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
+        front, beyond, bend, far, beside = _shade(view, method, *points)
         behind = jnp.where(found.beyond.face[:, None] >= 0, beyond, behind)
         smooth = rim.smooth
-        integral, moved = _along(found, front, bend, far, near, inner)
+        integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth[:, None], moved, front)
         mean = integral - rim.depth[:, None] * near
         value = jnp.where(
@@ -448,21 +451,25 @@ def _with_rows(records: Records, used: Array, rows: tuple[Array, ...], first: Ar
 
 
 def _along(
-    seen: Seen, front: Array, bend: Array, far: Array, near: Array, inner: Array
+    seen: Seen, front: Array, bend: Array, far: Array, near: Array, inner: Array, beside: Array
 ) -> tuple[Array, Array]:
     """The colour of a smooth surface from its rim to where the pixel ends.
 
     Its integral over this depth; and the colour that counts as the rim moves. As a point at a
     fixed depth keeps its colour, that is the one at the far end, less what the derivative of the
-    next pixel, which stands for this one's, says of it.
+    next pixel, which stands for this one's, says of it: as far as its colour is carried along, that
+    is its slope.
     """
     rim = seen.rim
-    first, depth, distance = (x[:, None] for x in (rim.first, rim.depth, rim.distance))
+    first, depth = rim.first[:, None], rim.depth[:, None]
     centre = jnp.clip(seen.centre_depth[:, None], first, depth)
     bends = first < depth
     far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
     far = jnp.where(bends, far, bend)
-    rise = jnp.where(bends, depth * (inner - far) / (distance - depth), far - front)
+    # A shadow may begin where the slope is taken.
+    colors = front, bend, far, inner
+    most = 2 * (functools.reduce(jnp.maximum, colors) - functools.reduce(jnp.minimum, colors))
+    rise = jnp.clip(depth * (inner - beside) / BESIDE, -most, most)
     # Seen from ever flatter above, it changes with the square root of the depth.
     mean = jnp.where(rim.single, 1 / 2, 2 / 3)[:, None]
     passes = centre > first

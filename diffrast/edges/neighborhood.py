@@ -8,6 +8,7 @@ from diffrast._stored import stored
 from diffrast.edges.planes import Table, corners_of, edge_values
 
 _STEPS = 64
+_BLOCK = 4  # pixels
 
 
 def picked(values: Array, index: Array) -> Array:
@@ -33,6 +34,21 @@ def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) 
     """The values of the 3×3 pixels round each pixel of an image with a border, shape (9, n)."""
     nine = jnp.arange(9)[:, None]
     return image[row + nine // 3, column + nine % 3]
+
+
+def blocks_with_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
+    """Whether blocks of pixels hold an empty one, with a border of one block all round."""
+    height, width = face_image.shape
+    bare = jnp.pad(face_image < 0, ((0, -height % _BLOCK), (0, -width % _BLOCK)))
+    rows = jnp.any(bare.reshape(-1, _BLOCK, bare.shape[1]), axis=1)
+    return jnp.pad(jnp.any(rows.reshape(rows.shape[0], -1, _BLOCK), axis=2), 1)
+
+
+def is_bare_near(
+    blocks: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
+) -> Bool[Array, " n"]:
+    """Whether one of the 3×3 blocks round pixels of an image with a border holds an empty one."""
+    return jnp.any(pixels_round(blocks, (column + 1) // _BLOCK, (row + 1) // _BLOCK), axis=0)
 
 
 def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "12 n"]:

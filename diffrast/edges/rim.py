@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast.edges.neighborhood import picked, pixel_at
-from diffrast.edges.planes import Columns, Table, corners_of, locate
+from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
 
+BESIDE = 0.05  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
 
@@ -19,11 +20,11 @@ class Rim(NamedTuple):
     smooth: Bool[Array, " n"]  # whether this pixel and the next show the same smooth surface
     inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards
     depth: Float[Array, " n"]  # how far the pixel reaches,
-    first: Float[Array, " n"]  # how far the face at the edge does, if that is less,
-    distance: Float[Array, " n"]  # and how far away the centre of the next pixel is
+    first: Float[Array, " n"]  # and how far the face at the edge does, if that is less
     bend: tuple[Int[Array, " n"], Columns]  # face and barycentrics where that face ends
     far: tuple[Int[Array, " n"], Columns]  # and where the pixel ends
     single: Bool[Array, " n"]  # whether one face covers what lies between
+    beside: tuple[Int[Array, " n"], Columns]  # point `BESIDE` outwards of the next pixel's centre
 
 
 def look_inwards(
@@ -56,7 +57,6 @@ def look_inwards(
     depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
     inner = stored(pixel_at(middle, inward, depth + 0.5))
     step = jnp.stack([inner % 3 - 1, inner // 3 - 1])
-    distance = jnp.sum((step - middle) * inward, axis=0)
     next_face = stored(picked(pictured, inner))
     ours = jnp.stack([picked(pictured, front_look), next_face])
     same = (ours >= 0) & (patches[jnp.maximum(ours, 0)] == patches[jnp.maximum(front, 0)])
@@ -67,14 +67,16 @@ def look_inwards(
     x, y = (centre + middle)[:, None] + jnp.stack([first, depth]) * inward[:, None]
     covered, at = locate(corners_of(face, faces, pixels), x, y)
     bend = [jnp.clip(b[0], 0, 1) for b in at]
+    x, y = centre + step - BESIDE * inward
+    beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
     return Rim(
         smooth=(front >= 0) & same[0] & same[1],
         inner=inner,
         depth=depth,
         first=first,
-        distance=jnp.maximum(distance, depth + 0.25),
         bend=(front, [b / total for b in bend]),
         far=(beyond, [b[1] for b in at]),
         single=covered[1],
+        beside=(next_face, beside),
     )

@@ -16,6 +16,7 @@ from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import (
     first_row,
+    is_bare_near,
     only,
     picked,
     pixel_at,
@@ -117,12 +118,12 @@ def look(
     topology: Topology,
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
-    has_background: Bool[Array, ""],
+    bare_blocks: Bool[Array, "rows columns"],
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `has_background` tells whether any of its pixels is empty.
+    one pixel all round; `bare_blocks` are those of `blocks_with_background`.
     """
     own, own_corners, fold, weights, ends, range_ = stored(
         (
@@ -227,7 +228,8 @@ def look(
 
     # Two walks over the surface: to the point just inside, from where a surface is seen that would
     # hide the piece if it reached it; and where nothing is found behind, to the point just beyond,
-    # from what is seen there; if that ends before, the background is bare.
+    # from what is seen there. If that ends before, and there are empty pixels not far away, the
+    # background is bare.
     before = fold & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     search = fold & ~found
     bare = pictured < 0
@@ -244,7 +246,8 @@ def look(
     hides = stored(arrives & foreign & (reached_depth > near * (1 + FINE_TOLERANCE)))
     visible = visible & ~hides[0] & ~hides[1]
     lies = arrives[1] & ~hides[1]
-    gap = search & there[1] & (reached[1] < 0) & (shown >= 0) & has_background
+    gap = search & there[1] & (reached[1] < 0) & (shown >= 0)
+    gap = gap & is_bare_near(bare_blocks, pieces.pixel[0], pieces.pixel[1])
     at_beyond = barycentrics([value[1] for value in values])
     beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached[1], beyond)))
     bare_look = first_row(bare)
