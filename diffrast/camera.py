@@ -33,6 +33,7 @@ from jaxtyping import Float
 from diffrast import _compensated, opencv, viewing
 from diffrast._check import ArrayInput, float_array, positive_int, real_number
 from diffrast._pytree import pytree_dataclass, set_field
+from diffrast._stored import stored
 from diffrast.linalg import apply_matrix, dot, normalize, null_vector
 
 
@@ -348,36 +349,74 @@ def viewpoint(camera: Camera) -> Float[Array, "4"]:
 def pixel_rays(camera: Camera, *, height: int, width: int) -> Float[Array, "height width 3"]:
     """Unit world direction, away from the viewer, of what is seen at every pixel's centre.
 
-    Raises:
-        ValueError: for a camera with distortion, whose rays have no closed form.
+    With distortion it is that of the point at infinity, or at any distance, that is drawn there.
+    Differentiable in the camera.
     """
     return normalize(pixel_directions(camera, height=height, width=width)[0])
 
 
 def pixel_directions(
     camera: Camera, *, height: int, width: int, border: int = 0
-) -> tuple[Float[Array, "_ _ 3"], Float[Array, "2 3"]]:
+) -> tuple[Float[Array, "_ _ 3"], Float[Array, "*pixels 2 3"]]:
     """`pixel_rays` of any length, also of pixels beyond the image; and their derivatives.
 
-    The second are those by a step to the next column, and to the next row: the same everywhere.
+    The second are those by a step to the next column, and to the next row: the same everywhere,
+    (2, 3), for a camera without distortion, else one for each pixel.
     """
     _check_single(camera)
-    if camera.distortion is not None:
-        raise ValueError("camera: wanted one without distortion")
     height, width = positive_int("height", height), positive_int("width", width)
-    first, second, depth, last = pivoted_matrix(camera)[0][:, :3]
+    columns, rows = (
+        (np.arange(-border, size + border) + 0.5 - size / 2).astype(camera.view.dtype)
+        for size in (width, height)
+    )
+    if camera.distortion is not None:
+        return _distorted_directions(camera, columns, rows, height, width)
+    centre, steps, depth = _directions(pivoted_matrix(camera)[0][:, :3], height, width)
+    rays = centre + columns[:, None] * steps[0] + rows[:, None, None] * steps[1]
+    sign = jnp.where(dot(centre, depth) < 0, -1, 1)
+    return sign * rays, sign * steps
+
+
+def _directions(
+    to_clip: Float[Array, "4 3"], height: int, width: int
+) -> tuple[Array, Array, Array]:
+    """Of the picture's middle, by a step to the next column and row; and the depth's row."""
+    first, second, depth, last = to_clip
     # The ray lies in the plane of its column, first - x last, and in that of its row.
     steps = jnp.stack(
         [jnp.cross(second, last) * (2 / width), jnp.cross(first, last) * (2 / height)]
     )
-    centre = jnp.cross(first, second)
-    columns, rows = (
-        (np.arange(-border, size + border) + 0.5 - size / 2).astype(centre.dtype)
-        for size in (width, height)
-    )
-    rays = centre + columns[:, None] * steps[0] + rows[:, None, None] * steps[1]
-    sign = jnp.where(dot(centre, depth) < 0, -1, 1)
-    return sign * rays, sign * steps
+    return jnp.cross(first, second), steps, depth
+
+
+def _distorted_directions(
+    camera: Camera, columns: np.ndarray, rows: np.ndarray, height: int, width: int
+) -> tuple[Array, Array]:
+    """`pixel_directions` in eye space, bent back there, then turned to the world."""
+    assert camera.distortion is not None
+    centre, steps, _ = _directions(camera.projection[:, :3], height, width)
+    x, y, z = camera.view[:3, :3]
+    turn = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)])  # inverse, but for size
+    turn = turn * jnp.where(dot(turn[0], x) < 0, -1, 1)
+
+    ray = [
+        centre[i] + columns * steps[0, i] + rows[:, None] * steps[1, i] for i in range(3)
+    ]  # (rows, columns) each
+    inverse = jnp.where(ray[2] != 0, -1, 0) / jnp.where(ray[2] != 0, ray[2], 1)
+    shown = stored((ray[0] * inverse, -ray[1] * inverse))
+    (a, b), change = opencv.undistort(shown, camera.distortion)
+    changes = []
+    for step in steps:  # of what is shown, then of the direction
+        moved = [
+            (step[0] + shown[0] * step[2]) * inverse,
+            -(step[1] - shown[1] * step[2]) * inverse,
+        ]
+        by_a, by_b = (
+            (change[0][i] * moved[0] + change[1][i] * moved[1])[..., None] for i in (0, 1)
+        )
+        changes.append(by_a * turn[0] - by_b * turn[1])
+    rays = a[..., None] * turn[0] - b[..., None] * turn[1] - turn[2]
+    return rays, jnp.stack(changes, axis=-2)
 
 
 # -------------------------------------------------------------------------------------- details

@@ -116,14 +116,11 @@ def skybox(
 ) -> Float[Array, "_ _ 3"]:
     """What each pixel sees of a cube texture that is infinitely far away.
 
-    Differentiable in the texels and the camera.
-
-    Raises:
-        ValueError: for a camera with distortion.
+    Differentiable in the texels and the camera, its distortion included.
     """
     with jax.named_scope("skybox"):
         rays, steps = pixel_directions(camera, height=height, width=width, border=border)
-        derivatives = jnp.broadcast_to(steps.T, (*rays.shape, 2))
+        derivatives = jnp.broadcast_to(jnp.swapaxes(steps, -1, -2), (*rays.shape, 2))
         return stored(sample_texture(texture, rays, derivatives=derivatives))
 
 

@@ -94,6 +94,17 @@ def test_a_light_without_an_ambient_part_adds_no_operation_for_it():
     assert times(without, "add") < times(with_it, "add")
 
 
+def test_a_camera_without_distortion_bends_nothing_back():
+    cube = dr.CubeTexture(np.ones((6, 4, 4, 3)))
+    bent = dataclasses.replace(CAMERA, distortion=jnp.zeros(5))
+    for objects in ([], scene({}).objects):
+        plain, sky = (dr.Scene(objects=objects, background=b) for b in (np.ones(3), cube))
+        without, sky_without = (loops(given, settings()) for given in (plain, sky))
+        program = [operations(dr.render, given, bent, settings()) for given in (plain, sky)]
+        assert sky_without == without == times(program[0], "while")
+        assert times(program[1], "while") > without
+
+
 # Derivatives --------------------------------------------------------------------------------------
 
 

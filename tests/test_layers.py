@@ -63,6 +63,7 @@ ORDER = [
     "diffrast.material",
     "diffrast.scene",
     "diffrast.files._mesh_text",
+    "diffrast.files._gltf",
     "diffrast.files.meshes",
     "diffrast.files.images",
     "diffrast.files.objects",

@@ -1,3 +1,4 @@
+import base64
 import builtins
 import dataclasses
 import json
@@ -197,6 +198,166 @@ def test_gltf_textures_arrive_in_objects(tmp_path):
     np.testing.assert_allclose(item.material.diffuse, [0.2, 0.4, 1], atol=1 / 255)
     image = item.material.texture.image
     np.testing.assert_allclose(image, [[[1, 0, 0], [0, 0.502886, 0]]], atol=1e-5)
+
+
+def gltf_tree(tmp_path):
+    """A square with a texture, as the JSON of a glTF file."""
+    Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8)).save(tmp_path / "t.png")
+    save_mesh(tmp_path / "square.gltf", shapes.plane())
+    tree = json.loads((tmp_path / "square.gltf").read_text())
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    tree["textures"], tree["images"] = [{"source": 0, "sampler": 0}], [{"uri": "t.png"}]
+    tree["samplers"] = [{}]
+    return tree
+
+
+def texture_info(tree):
+    return tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+
+
+def as_glb(tree):
+    """The JSON alone as a binary file; its buffers keep their URIs."""
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = [np.uint32(n).tobytes() for n in (2, 20 + len(text), len(text))]
+    return b"glTF" + sizes[0] + sizes[1] + sizes[2] + b"JSON" + text
+
+
+SAMPLERS = [
+    ({}, ("repeat", "repeat"), "bilinear"),
+    ({"wrapS": 33071}, ("clamp", "repeat"), "bilinear"),
+    ({"wrapS": 10497, "wrapT": 33648}, ("repeat", "mirror"), "bilinear"),
+    ({"wrapS": 33648, "wrapT": 33071}, ("mirror", "clamp"), "bilinear"),
+    ({"magFilter": 9728, "minFilter": 9728}, ("repeat", "repeat"), "nearest"),
+    ({"magFilter": 9728, "minFilter": 9987}, ("repeat", "repeat"), "nearest"),
+    ({"minFilter": 9728}, ("repeat", "repeat"), "nearest"),
+    ({"magFilter": 9729, "minFilter": 9728}, ("repeat", "repeat"), "bilinear"),
+    ({"magFilter": 9729, "minFilter": 9987}, ("repeat", "repeat"), "trilinear"),
+    ({"minFilter": 9984}, ("repeat", "repeat"), "trilinear"),
+]
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+def test_gltf_samplers_arrive_in_textures(tmp_path, suffix):
+    """Of several materials in one file, each with its own sampler and the same picture."""
+    tree = gltf_tree(tmp_path)
+    count = len(SAMPLERS)
+    tree["samplers"] = [sampler for sampler, _, _ in SAMPLERS]
+    tree["textures"] = [{"source": 0, "sampler": k} for k in range(count)] + [{"source": 0}]
+    tree["materials"] = [
+        {"name": "same", "pbrMetallicRoughness": {"baseColorTexture": {"index": k}}}
+        for k in range(count + 1)
+    ]
+    (primitive,) = tree["meshes"][0]["primitives"]
+    tree["meshes"][0]["primitives"] = [{**primitive, "material": k} for k in range(count + 1)]
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(as_glb(tree) if suffix == ".glb" else json.dumps(tree).encode())
+    textures = [item.material.texture for item in load_objects(path)]
+    wanted = [(wrap, filter_) for _, wrap, filter_ in SAMPLERS]
+    assert [(t.wrap, t.filter) for t in textures] == [*wanted, wanted[0]]
+    assert textures[0] is textures[-1]
+    parts = load_mesh_parts(path)
+    assert parts[-1].wrap == ("repeat", "repeat")
+    assert parts[-1].filter is None
+    given = [item.material.texture for item in load_objects(path, filter="nearest", wrap="clamp")]
+    assert {(t.wrap, t.filter) for t in given} == {(("clamp", "clamp"), "nearest")}
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint8, np.uint16])
+def test_gltf_textures_take_the_coordinates_they_ask_for(tmp_path, kind):
+    tree = gltf_tree(tmp_path)
+    limit = 1 if kind == np.float32 else np.iinfo(kind).max
+    other = (np.array([[0, 1], [1, 1], [0, 0.2], [1, 0.2]]) * limit).astype(kind)
+    data = base64.b64encode(other.tobytes()).decode()
+    uri = f"data:application/octet-stream;base64,{data}"
+    tree["buffers"].append({"uri": uri, "byteLength": other.nbytes})
+    view = {"buffer": len(tree["buffers"]) - 1, "byteOffset": 0, "byteLength": other.nbytes}
+    tree["bufferViews"].append(view)
+    accessor = {
+        "bufferView": len(tree["bufferViews"]) - 1,
+        "componentType": {np.float32: 5126, np.uint8: 5121, np.uint16: 5123}[kind],
+        "normalized": kind != np.float32,
+        "count": 4,
+        "type": "VEC2",
+    }
+    tree["accessors"].append(accessor)
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = len(tree["accessors"]) - 1
+    path = write(tmp_path / "a.gltf", json.dumps(tree))
+    np.testing.assert_allclose(load_objects(path)[0].mesh.uvs, shapes.plane().uvs, atol=1e-6)
+    texture_info(tree)["texCoord"] = 1
+    write(path, json.dumps(tree))
+    wanted = [[0, 0], [1, 0], [0, 0.8], [1, 0.8]]
+    np.testing.assert_allclose(load_objects(path)[0].mesh.uvs, wanted, atol=2e-3)
+    np.testing.assert_allclose(load_mesh(path).uvs, wanted, atol=2e-3)
+
+
+def test_gltf_texture_transforms_move_the_coordinates(tmp_path):
+    """The extension's own example: the lower left quarter of the picture, turned clockwise."""
+    tree = gltf_tree(tmp_path)
+    moved = {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}
+    texture_info(tree)["extensions"] = {"KHR_texture_transform": moved}
+    path = write(tmp_path / "a.gltf", json.dumps(tree))
+    u, v = np.asarray(shapes.plane().uvs).T
+    np.testing.assert_allclose(load_mesh(path).uvs, np.c_[(1 - v) / 2, u / 2], atol=1e-6)
+    moved["scale"], moved["texCoord"] = [1, -1], 0
+    del moved["rotation"]
+    write(path, json.dumps(tree))
+    np.testing.assert_allclose(load_mesh(path).uvs, np.c_[u, 1 - v], atol=1e-6)
+
+
+BROKEN_TEXTURES = {
+    "index of a sampler": (
+        lambda tree: tree["textures"][0].update(sampler=1),
+        r"textures\[0\]: sampler: wanted an index in \[0, 1\), got 1",
+    ),
+    "wrap": (
+        lambda tree: tree["samplers"][0].update(wrapT=5),
+        r"samplers\[0\]: wanted wrapT to be one of 10497, 33071, 33648, got 5",
+    ),
+    "filter": (
+        lambda tree: tree["samplers"][0].update(magFilter="LINEAR"),
+        r"samplers\[0\]: wanted magFilter to be one of 9728, 9729, got 'LINEAR'",
+    ),
+    "samplers": (
+        lambda tree: tree.update(samplers={"wrapS": 10497}),
+        "samplers: wanted a list of objects, got",
+    ),
+    "index of a texture": (
+        lambda tree: texture_info(tree).update(index=-1),
+        r"materials\[0\]: texture: wanted an index in \[0, 1\), got -1",
+    ),
+    "index of a material": (
+        lambda tree: tree["meshes"][0]["primitives"][0].update(material=7),
+        r"meshes\[0\]: material: wanted an index in \[0, 1\), got 7",
+    ),
+    "set of coordinates": (
+        lambda tree: texture_info(tree).update(texCoord=0.5),
+        r"materials\[0\]: wanted a whole number texCoord, got 0.5",
+    ),
+    "coordinates that are not there": (
+        lambda tree: texture_info(tree).update(texCoord=2),
+        r"meshes\[0\]: wanted TEXCOORD_2 for its texture, got \['TEXCOORD_0'\]",
+    ),
+    "transform": (
+        lambda tree: texture_info(tree).update(
+            extensions={"KHR_texture_transform": {"scale": [1, None]}}
+        ),
+        r"materials\[0\]: wanted two numbers as scale, got \[1, None\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+@pytest.mark.parametrize("case", BROKEN_TEXTURES)
+def test_broken_gltf_textures_are_named_with_their_file(tmp_path, case, suffix):
+    change, message = BROKEN_TEXTURES[case]
+    tree = gltf_tree(tmp_path)
+    change(tree)
+    path = tmp_path / f"broken{suffix}"
+    path.write_bytes(as_glb(tree) if suffix == ".glb" else json.dumps(tree).encode())
+    with pytest.raises(ValueError, match=rf"broken{suffix}: cannot be read as .*{message}"):
+        load_objects(path)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])

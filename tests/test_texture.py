@@ -159,15 +159,33 @@ def test_anisotropy_averages_along_the_longer_side():
     np.testing.assert_allclose(np.sort(sharp), [0] * 4 + [1] * 4, atol=1e-5)
 
 
-def test_mipmaps_of_a_receding_floor_are_near_to_many_samples():
-    """A checkerboard up to where its squares are far smaller than pixels; 256 samples a pixel."""
-    image = np.float32((np.indices((64, 64)) // 32).sum(axis=0)[..., None] % 2)
+def straight_floor(scale):
+    """Coordinates on a plane one unit below the eye, through a 32² picture up to the horizon."""
 
     def floor(column, row):
-        """Coordinates on a plane one unit below the eye, through a 32² picture."""
         depth = 1 / ((row + 0.7) / 40)
-        return np.stack([column / 40 * depth + 0.13 * depth, depth], axis=-1) * 8
+        return np.stack([column / 40 * depth + 0.13 * depth, depth], axis=-1) * scale
 
+    return floor
+
+
+def tilted_floor(pitch, turn):
+    """The same for an eye that looks down by the angle `pitch`, the floor turned by `turn`."""
+
+    def floor(column, row):
+        x, y = column / 40, (row - 16) / 40
+        depth = 1 / (np.sin(pitch) + y * np.cos(pitch))
+        across, ahead = x * depth, (np.cos(pitch) - y * np.sin(pitch)) * depth
+        u = np.cos(turn) * across - np.sin(turn) * ahead
+        v = np.sin(turn) * across + np.cos(turn) * ahead
+        return 6 * np.stack([u, v], axis=-1)
+
+    return floor
+
+
+def floor_errors(floor, *ways):
+    """Root mean square errors of a checkerboard of 64² texels against 256 samples a pixel."""
+    image = np.float32((np.indices((64, 64)) // 32).sum(axis=0)[..., None] % 2)
     at = np.arange(32.0)
     column, row = np.meshgrid(at - 16 + 0.5, at + 0.5)
     h = 1e-5
@@ -178,19 +196,42 @@ def test_mipmaps_of_a_receding_floor_are_near_to_many_samples():
         for k in range(2)
     ]
     steps = np.stack(steps, axis=-1).astype(np.float32)
+    uv = floor(column, row).astype(np.float32)
     fine = (np.arange(512) + 0.5) / 16
     many = bilinear(image, floor(*np.meshgrid(fine - 16, fine)).reshape(-1, 2))
     truth = many.reshape(32, 16, 32, 16).mean(axis=(1, 3))
 
-    def error(**options):
-        uv = floor(column, row).astype(np.float32)
+    def error(options):
         got = dr.sample_texture(dr.Texture(image, **options), uv, derivatives=steps)[..., 0]
         return np.sqrt(np.mean((np.asarray(got) - truth) ** 2))
 
-    mipmap = error(filter="trilinear")
-    assert mipmap < error(filter="nearest") / 5
-    assert mipmap < error(filter="bilinear") / 2
-    assert error(filter="trilinear", anisotropy=4) < 0.7 * mipmap
+    return [error(options) for options in ways]
+
+
+NEAREST, BILINEAR, MIPMAP = ({"filter": name} for name in FILTERS)
+
+
+def test_mipmaps_of_a_receding_floor_are_near_to_many_samples():
+    """A checkerboard up to where its squares are far smaller than pixels."""
+    ways = NEAREST, BILINEAR, MIPMAP, {**MIPMAP, "anisotropy": 4}
+    nearest, smooth, mipmap, sharp = floor_errors(straight_floor(8), *ways)
+    assert mipmap < nearest / 5
+    assert mipmap < smooth / 2
+    assert sharp < 0.7 * mipmap
+
+
+@pytest.mark.parametrize(
+    "floor",
+    [straight_floor(scale) for scale in (1.6, 3.2, 6.15, 16)]
+    + [tilted_floor(pitch, turn) for pitch in (0.45, 0.7, 1.0) for turn in (0.0, 0.4)],
+)
+def test_two_places_along_the_footprint_suffice_for_floors(floor):
+    ways = NEAREST, BILINEAR, MIPMAP, {**MIPMAP, "anisotropy": 2}
+    nearest, smooth, mipmap, sharp = floor_errors(floor, *ways)
+    assert mipmap < nearest / 4
+    assert mipmap < smooth / 3.7
+    assert sharp < nearest / 6
+    assert sharp < smooth / 5
 
 
 # ------------------------------------------------------------------------------------ derivatives

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import check_derivatives
 from jax.flatten_util import ravel_pytree
+from scipy.ndimage import binary_erosion
 from test_render import operations, times
 
 import diffrast as dr
@@ -175,6 +177,40 @@ def test_skybox_in_the_background():
     alone = dr.render(dr.Scene(objects=[], background=cube), CAMERA, settings(samples=4))
     want = fine.reshape(SIZE, 2, SIZE, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(alone, want, atol=1e-5)
+
+
+def test_skybox_seen_through_a_lens():
+    cube = dr.CubeTexture(RNG.uniform(size=(6, 16, 16, 3)), filter="trilinear")
+    camera = replace(CAMERA, distortion=jnp.array([-0.2, 0.1, 0.01, -0.02, 0.03]))
+    small = dr.Object(shapes.cube(), transform=dr.linalg.scaling((0.5, 0.5, 0.5)))
+    scene = dr.Scene(objects=[small], background=cube)
+    rays, steps = dr.camera.pixel_directions(camera, height=32, width=32)
+    want = dr.sample_texture(cube, rays, derivatives=np.swapaxes(steps, -1, -2))
+    options = settings(height=32, width=32, shading="unlit", antialias=True)
+    image = np.asarray(dr.render(scene, camera, options))
+    outside = np.asarray(image == image[16, 16]).all(axis=-1) == 0
+    empty = binary_erosion(outside, np.ones((5, 5)))  # not at the outlines
+    assert 50 < empty.sum() < empty.size - 50
+    np.testing.assert_allclose(image[empty], np.asarray(want)[empty], atol=1e-5)
+    straight = dr.sample_texture(cube, dr.camera.pixel_rays(CAMERA, height=32, width=32))
+    assert np.abs(straight - want).max() > 0.1
+
+
+def test_derivatives_of_a_skybox_seen_through_a_lens():
+    """By the lens, the view and the texels, of smooth sides: against differences in float64."""
+    with jax.enable_x64(True):
+        images = 0.5 + 0.3 * np.sin(np.arange(6 * 8 * 8 * 3).reshape(6, 8, 8, 3) / 29)
+        make = dr.Camera.perspective
+        straight = make(eye=(0.4, 0.3, 3), target=(0, 0, 0), fov_y=0.9, near=0.5, far=20)
+
+        def image(images, view, lens):
+            camera = replace(straight, view=view, distortion=lens)
+            scene = dr.Scene(objects=[], background=dr.CubeTexture(images, filter="trilinear"))
+            return dr.render(scene, camera, settings())
+
+        lens = np.array([-0.2, 0.1, 0.01, -0.02, 0.03])
+        arguments = images, straight.view, lens
+        check_derivatives(image, *arguments, step=1e-7, rtol=1e-5, atol=1e-5)
 
 
 def test_edges_of_a_textured_scene():

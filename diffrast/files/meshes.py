@@ -6,7 +6,6 @@ checks text formats first.
 """
 
 import io
-import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from diffrast.color import srgb_to_linear
+from diffrast.files import _gltf
 from diffrast.files._mesh_text import check_ascii_ply, check_ascii_stl, check_off, plain_obj
 from diffrast.linalg import normalize
 from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
@@ -28,7 +28,10 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 
 class MeshPart(NamedTuple):
-    """The faces of a file that share a material; what the file does not say is `None`."""
+    """The faces of a file that share a material; what the file does not say is `None`.
+
+    `wrap` and `filter` are those of a `Texture`.
+    """
 
     name: str
     mesh: Mesh
@@ -37,6 +40,8 @@ class MeshPart(NamedTuple):
     specular: Float[np.ndarray, "3"] | None = None
     shininess: float | None = None
     texture: Float[np.ndarray, "height width channels"] | None = None
+    wrap: tuple[str, str] | None = None
+    filter: str | None = None
 
 
 def load_mesh(path: str | Path) -> Mesh:
@@ -67,8 +72,13 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
     numbers. Textures are linear RGB or RGBA, row 0 at the top; v of the uvs points up. A material
     file or picture that cannot be found leaves `None`.
 
+    A glTF texture has the wraps of its sampler, and of its filters the nearest one: "nearest" if
+    its texels are to be seen from nearby, else "trilinear" if it has smaller images for afar, else
+    "bilinear"; None if the file leaves that open. The uvs are those that it asks for (`texCoord`),
+    after its KHR_texture_transform.
+
     Raises:
-        As `load_mesh`.
+        As `load_mesh`; ValueError also for a glTF mesh without the coordinates its texture takes.
     """
     return _read_parts(Path(path), materials=True)
 
@@ -106,14 +116,17 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
     with _quiet_trimesh() as trimesh:
         content, options = _checked(content, suffix, path, materials)
         try:
+            uses = None
+            if suffix in (".glb", ".gltf"):
+                content, uses = _gltf.prepare(content, suffix, need_coordinates=materials)
             scene = trimesh.load_scene(
-                io.BytesIO(_with_gltf_materials(content, suffix)),
+                io.BytesIO(content),
                 file_type=suffix[1:],
                 resolver=trimesh.resolvers.FilePathResolver(str(path)),
                 process=False,
                 **options,
             )
-            parts = list(_scene_parts(trimesh, scene))
+            parts = list(_scene_parts(trimesh, scene, uses))
         # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
         except Exception as error:
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -147,42 +160,30 @@ def _checked(
     return content, {}
 
 
-def _with_gltf_materials(content: bytes, suffix: str) -> bytes:
-    """Give a material to glTF primitives without one: trimesh reads no uvs for those."""
-    if suffix not in (".glb", ".gltf"):
-        return content
-    start, end = 0, len(content)
-    if suffix == ".glb":  # 12 bytes of header, then length, type and data of the JSON chunk
-        start, end = 20, 20 + int.from_bytes(content[12:16], "little")
-    tree = json.loads(content[start:end])
-    missing = len(tree.setdefault("materials", []))
-    tree["materials"].append({})
-    for mesh in tree.get("meshes", []):
-        for primitive in mesh["primitives"]:
-            primitive.setdefault("material", missing)
-    text = json.dumps(tree).encode()
-    if suffix == ".gltf":
-        return text
-    text += b" " * (-len(text) % 4)
-    total = len(content) - (end - start) + len(text)
-    sizes = (total.to_bytes(4, "little"), len(text).to_bytes(4, "little"))
-    return content[:8] + sizes[0] + sizes[1] + content[16:20] + text + content[end:]
-
-
-def _scene_parts(trimesh: ModuleType, scene: Any) -> Iterator[MeshPart]:
+def _scene_parts(
+    trimesh: ModuleType, scene: Any, uses: list[_gltf.TextureUse | None] | None
+) -> Iterator[MeshPart]:
+    """The parts of a scene; `uses` are those of textures in a glTF file."""
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
             continue
-        mesh = _converted(geometry)
+        fields = _material(getattr(geometry.visual, "material", None))
+        uvs = getattr(geometry.visual, "uv", None)
+        if uses is not None:
+            use = _gltf.use_of(geometry, uses)
+            uvs = _gltf.coordinates_of(geometry, use)
+            if use is not None and "texture" in fields:
+                fields |= {"wrap": use.wrap, "filter": use.filter}
+        mesh = _converted(geometry, uvs)
         if not np.array_equal(matrix, np.eye(4)):
             mesh = transform(mesh, matrix)
-        yield MeshPart(name, mesh, **_material(getattr(geometry.visual, "material", None)))
+        yield MeshPart(name, mesh, **fields)
 
 
-def _converted(geometry: Any) -> Mesh:
-    normals, uvs = None, getattr(geometry.visual, "uv", None)
+def _converted(geometry: Any, uvs: Any) -> Mesh:
+    normals = None
     # `vertex_normals` would be computed where the file has none; its cache tells.
     if "vertex_normals" in geometry._cache:
         normals = normalize(np.array(geometry.vertex_normals))

@@ -12,7 +12,10 @@ from diffrast.texture import Texture
 
 
 def load_objects(
-    path: str | Path, *, filter: str = "bilinear", wrap: str | tuple[str, str] = "repeat"
+    path: str | Path,
+    *,
+    filter: str | None = None,
+    wrap: str | tuple[str, str] | None = None,
 ) -> list[Object]:
     """Read a mesh file as objects, one for each of its materials.
 
@@ -20,12 +23,14 @@ def load_objects(
     and texture (map_Kd); glTF the base colour and its texture. Pictures are decoded from sRGB to
     linear, without their alpha; what the file does not say is as in `Material()`, but that a
     texture without a colour is shown as it is, and a highlight of no colour is none. Parts with
-    one picture share one `Texture`. Meshes without normals get smooth ones.
+    one picture, filtered and wrapped alike, share one `Texture`. Meshes without normals get smooth
+    ones.
 
     Args:
         path: the file, as for `load_mesh`.
-        filter: of the textures.
-        wrap: likewise.
+        filter: of the textures; None for what the file says (glTF does, see `load_mesh_parts`),
+            or else "bilinear".
+        wrap: likewise, or else "repeat".
 
     Raises:
         As `load_mesh`.
@@ -36,10 +41,13 @@ def load_objects(
         if part.texture is None or part.mesh.uvs is None:
             return None
         picture = np.ascontiguousarray(part.texture[..., :3])
-        key = (picture.shape, picture.tobytes())
-        if key not in textures:
-            textures[key] = Texture(picture, filter=filter, wrap=wrap)
-        return textures[key]
+        texture = Texture(
+            picture,
+            filter=(part.filter or "bilinear") if filter is None else filter,
+            wrap=(part.wrap or "repeat") if wrap is None else wrap,
+        )
+        key = (picture.shape, picture.tobytes(), texture.filter, texture.wrap)
+        return textures.setdefault(key, texture)
 
     objects = []
     for part in load_mesh_parts(path):

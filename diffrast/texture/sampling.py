@@ -111,12 +111,10 @@ def sample(
     along, height = _ellipse(steps, count)
     offset = (jnp.arange(count) + 0.5) / count - 0.5
     offset = offset.reshape(-1, *(1,) * coordinates[0].ndim).astype(coordinates[0].dtype)
-    places = [
-        c + offset * jnp.where(along, pair[0], pair[1])
-        for c, pair in zip(coordinates, slopes, strict=True)
-    ]
+    axis = stored([jnp.where(along, pair[0], pair[1]) for pair in slopes])
+    places = stored([c + offset * a for c, a in zip(coordinates, axis, strict=True)])
     height = stored(_clamped(height, last))
-    colors = _trilinear(rows, layout, which, side, places, wrap, height)
+    colors = stored(_trilinear(rows, layout, which, side, places, wrap, height))
     return jnp.mean(colors, axis=0)
 
 
