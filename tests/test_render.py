@@ -295,7 +295,8 @@ def test_derivatives_in_everything_agree_to_second_order():
         np.testing.assert_allclose(curvature, difference, atol=1e-5 * np.abs(difference).max())
 
 
-def test_vertices_of_no_face_may_hold_anything():
+@pytest.mark.parametrize("shading", ["phong", "gouraud"])
+def test_vertices_of_no_face_may_hold_anything(shading):
     """The derivatives are those of the mesh without them, by what all vertices share, too."""
     scene, camera = scenes.one_object(), scenes.perspective()
     item = scene.objects[0]
@@ -307,7 +308,7 @@ def test_vertices_of_no_face_may_hold_anything():
         def loss(vertices, normals, transform, camera):
             mesh = dr.Mesh(vertices=vertices, faces=item.mesh.faces, normals=normals)
             moved = replace(scene, objects=[dr.Object(mesh, item.material, transform)])
-            return jnp.vdot(weights, dr.render(moved, camera, settings()))
+            return jnp.vdot(weights, dr.render(moved, camera, settings(shading=shading)))
 
         return jax.grad(loss, argnums=(0, 1, 2, 3))(vertices, normals, item.transform, camera)
 
