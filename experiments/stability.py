@@ -36,6 +36,7 @@ from common import pyplot, save_json
 from stress_measures import GROUPS, Group, Measures, failures, float64_measures, measured, picture
 from stress_scenes import CONTINUOUS, NAMES, Case, Parts
 
+LARGE = 4096  # rows and columns
 DOUBLED = 8  # batches of "edges" that are drawn in float64, too
 Row = dict[str, Any]  # group, stressor, magnitude, and measures
 
@@ -140,7 +141,7 @@ def _large(number: int, seed: int) -> Row:
     for name in ("plain", "edges"):
 
         def loss(varied: Any, group: Group = GROUPS[name]) -> Any:
-            image = picture(varied | given, group, 4096)[0]
+            image = picture(varied | given, group, LARGE)[0]
             return jnp.mean(image**2), jnp.sum(~jnp.isfinite(image))
 
         (_, wrong), slopes = jax.jit(jax.value_and_grad(loss, has_aux=True))(varied)

@@ -31,7 +31,7 @@ class Group(NamedTuple):
         own_normals: whether the mesh has none, so that they are found from its faces.
         shadow: of both lights.
         share: of the scenes, since some take longer than others.
-        compared: share of these that are drawn in float64, and changed without effect.
+        compared: share of these that are changed without effect, too.
     """
 
     settings: dict[str, Any]
@@ -259,8 +259,8 @@ def failures(measures: Measures) -> Iterator[tuple[str, np.ndarray]]:
 def in_double(path: Path) -> None:
     """Draw the batches of a file, in a process whose numbers have twice the digits."""
     with np.load(path) as file:
-        given, size = dict(file), int(file["size"])
-    del given["size"]
+        given, size = dict(file), int(file["pixels"])
+    del given["pixels"]
     draw = jax.jit(jax.vmap(lambda parts: picture(parts, GROUPS["edges"], size)[0]))
     exact = {key: p if key == "faces" else p.astype(np.float64) for key, p in given.items()}
     images = [
@@ -274,7 +274,7 @@ def float64_measures(batches: list[Parts], images: list[np.ndarray], size: int) 
     """How far pictures with edges are from the library's in float64."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenes.npz"
-        np.savez(path, size=size, **stress_scenes.stacked(batches))
+        np.savez(path, pixels=size, **stress_scenes.stacked(batches))
         command = [sys.executable, __file__, str(path)]
         subprocess.run(command, check=True, env=os.environ | {"JAX_ENABLE_X64": "1"})
         truths = np.load(path.with_suffix(".npy"))

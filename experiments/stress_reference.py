@@ -7,9 +7,9 @@ face by 1/w, Phong's shading.
 Vertices in the picture are known to a part in 2^24 of their homogeneous coordinates, and snap to
 1/1024 pixel. A pixel is *clear* where neither can change what is seen: no edge and no plane near
 or far within `MARGIN` pixels and the rounding of its line, no second face within the rounding of
-the depth. How far a clear colour may be off is found by shaking: the picture is drawn again with
-every coordinate moved by some ulps, the visible points to the eight corners of that range, and
-what that changes, float32 cannot know.
+the depth, no light so near that rounding turns it. How far a clear colour may be off is found by
+shaking: the picture is drawn again with every coordinate moved by some ulps, visible points and
+viewer to opposite corners of that range, and what that changes, float32 cannot know.
 """
 
 from typing import NamedTuple
@@ -22,6 +22,7 @@ MARGIN = 2e-3  # pixels: vertices snap to within 0.0007, and their rounding adds
 ROUNDINGS = 8.0  # in a line, in units of EPSILON times the sum of its terms' sizes
 DEPTH = 1e-5  # relative difference of 1/w that tells which face is nearer
 TOLERANCE = 2e-4  # of a colour, besides
+UNKNOWN = 0.02  # change by shaking from which on a colour means nothing
 AMBIENT, SPECULAR, SHININESS = 0.1, 0.3, 8.0
 BACKGROUND = (0.1, 0.2, 0.3)
 ATTENUATION = (0.5, 0.1, 0.05)  # at distances in units of the scene's size
@@ -70,7 +71,8 @@ def reference(parts: Parts, cameras: Cameras, size: int) -> Reference:
 
             clip = np.einsum("brc,bvc->bvr", cameras.projection, shaken(eye))
             seen = _visible(shaken(clip), given["vertices"], faces, size)
-            return seen, _shade(given, faces, seen, shaken(viewer), shake * corner)
+            opposite = viewer - shake * corner * np.abs(viewer)
+            return seen, _shade(given, faces, seen, opposite, shake * corner)
 
         seen, image = draw(0.0, np.zeros(3))
         clear, change = seen.clear, np.zeros(seen.face.shape)
@@ -78,7 +80,8 @@ def reference(parts: Parts, cameras: Cameras, size: int) -> Reference:
             other, other_image = draw(4 * EPSILON, corner)
             clear = clear & (other.face == seen.face)
             change = np.maximum(change, np.abs(other_image - image).max(axis=-1))
-    bound = TOLERANCE * (1 + np.abs(image).max(axis=-1)) + 2 * change
+    clear &= change <= UNKNOWN
+    bound = TOLERANCE * (1 + np.abs(image).max(axis=-1)) + 8 * change
     square = (count, size, size)
     return Reference(image.reshape(*square, 3), clear.reshape(square), bound.reshape(square))
 
