@@ -19,7 +19,10 @@ right angles, and moved anyhow (compared with the float64 picture of that), have
 
 Written to `--out`: `stability.json` with counts and worst errors of each stressor by its magnitude,
 `stability.png`, and for each kind of failure the first scene, to be drawn again by `--replay`.
-Expected: nothing that is not finite, and no clear pixel beyond its bound.
+Expected: nothing that is not finite, and no clear pixel beyond its bound. At the stressors' own
+magnitudes clear colours are off by 2e-6 at most, but for an eye within 1e-4 of a face it looks at,
+and for scenes far from the origin, whose visible points float32 rounds to 1e-7 of their distance
+from it. How long it takes: a quarter of an hour on two busy cores, most of it "plain".
 """
 
 import argparse
@@ -215,9 +218,13 @@ def plot(report: dict[str, Any], path: Path) -> None:
             values = [max(cell[measure][statistic], 1e-9) for cell in known]
             places = [cell["magnitude"] for cell in known]
             axis.plot(places, values, "o-", markersize=3, label=label)
-        sizes = [abs(m) for m in places if m] if (places := _magnitudes(by_group)) else [1.0]
+        places = sorted({cell["magnitude"] for cells in by_group.values() for cell in cells})
+        sizes = [abs(magnitude) for magnitude in places if magnitude] or [1.0]
         if max(sizes) > 50 * min(sizes):
             axis.set_xscale("symlog", linthresh=min(sizes))
+            shown = places[:: -(-len(places) // 5)]
+            axis.set_xticks(shown, [f"{magnitude:g}" for magnitude in shown])
+            axis.minorticks_off()
         axis.set_yscale("log")
         axis.set_ylim(5e-10, 2)
         axis.set_title(stressor)
@@ -225,10 +232,6 @@ def plot(report: dict[str, Any], path: Path) -> None:
     axes.flat[0].legend(fontsize=7)
     figure.savefig(path, dpi=90)
     plt.close(figure)
-
-
-def _magnitudes(by_group: dict[str, Any]) -> list[float]:
-    return sorted({cell["magnitude"] for cells in by_group.values() for cell in cells})
 
 
 def main() -> None:
