@@ -34,7 +34,7 @@ from diffrast import _compensated, opencv, viewing
 from diffrast._check import ArrayInput, float_array, positive_int, real_number
 from diffrast._pytree import pytree_dataclass, set_field
 from diffrast._stored import stored
-from diffrast.linalg import apply_matrix, dot, normalize, null_vector
+from diffrast.linalg import apply_matrix, dot, normalize, null_vector, where_finite
 
 
 @pytree_dataclass
@@ -299,10 +299,16 @@ def world_to_clip(camera: Camera, positions_world: ArrayInput) -> Float[Array, "
 @jax.jit
 def _world_to_clip(camera: Camera, positions_world: Array) -> Array:
     remainder = jnp.append(camera.view_remainder, 0)
-    positions_eye = _compensated.affine(camera.view, remainder, positions_world)
-    if camera.distortion is not None:
-        positions_eye = opencv.distort(positions_eye, camera.distortion)
-    return apply_matrix(camera.projection, positions_eye)
+
+    def project(positions_eye: Array) -> Array:
+        if camera.distortion is not None:
+            positions_eye = opencv.distort(positions_eye, camera.distortion)
+        return apply_matrix(camera.projection, positions_eye)
+
+    positions_eye = where_finite(
+        lambda points: _compensated.affine(camera.view, remainder, points), positions_world
+    )
+    return where_finite(project, positions_eye)
 
 
 def direction_to_clip(camera: Camera, direction: Float[Array, "*batch 3"]) -> Array:

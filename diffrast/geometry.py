@@ -1,5 +1,6 @@
 """A scene as one mesh in the world, and the points of it that are seen."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from diffrast._topology import Edges, Topology, traced_topology
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
-from diffrast.linalg import mirrors, transform_normals, transform_points
+from diffrast.linalg import mirrors, transform_normals, transform_points, where_finite
 from diffrast.mesh import face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
 from diffrast.raster.evaluate import (
@@ -63,7 +64,7 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
         first_vertex = first_uv = 0
         for item in scene.objects:
             mesh = item.mesh
-            positions.append(transform_points(item.transform, mesh.vertices))
+            positions.append(where_finite(partial(transform_points, item.transform), mesh.vertices))
             faces.append(mesh.faces + first_vertex)
             turned = jnp.where(mirrors(item.transform), faces[-1][:, ::-1], faces[-1])
             faces_outward.append(turned)
@@ -72,7 +73,7 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
                 own = mesh.normals
                 if own is None:
                     own = vertex_normals(mesh.vertices, mesh.faces)
-                normals.append(transform_normals(item.transform, own))
+                normals.append(where_finite(partial(transform_normals, item.transform), own))
             if textured:
                 own = mesh.uvs
                 none = jnp.zeros_like(mesh.vertices[:, :2])

@@ -19,6 +19,7 @@ as others, and exactly degenerate input has a defined value with a finite gradie
 import functools
 import math
 import operator
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -218,6 +219,16 @@ def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     orientation = jnp.where(dot(a, cofactors[:, 0]) < 0, -1, 1)
     return normalize(apply_matrix(orientation * cofactors, normals))
+
+
+def where_finite(function: Callable[[Array], Array], vectors: Array) -> Array:
+    """`function(vectors)`, and NaN without a derivative where a vector (last axis) is not finite.
+
+    Where the result is not used its cotangent is zero, but zero times NaN is NaN: one such vector
+    would spoil the derivative by all that the vectors have in common.
+    """
+    finite = jnp.all(jnp.isfinite(vectors), axis=-1, keepdims=True)
+    return jnp.where(finite, function(jnp.where(finite, vectors, 0)), jnp.nan)
 
 
 def mirrors(matrix: ArrayInput) -> Bool[Array, ""]:

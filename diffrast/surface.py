@@ -24,6 +24,7 @@ from diffrast.light import (
     normalize_columns,
     without_ambient,
 )
+from diffrast.linalg import where_finite
 from diffrast.scene import Scene
 from diffrast.shade import Reflectance, Surface, needs, phong
 from diffrast.shadows import Reached, Shadows, cast, outlines, receive
@@ -124,13 +125,17 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     assert geometry.normals is not None
     vertices = jnp.arange(geometry.positions.shape[0])
     reflectance = _reflectance(scene, geometry.object_of_vertex, vertices)
-    position = [geometry.positions[:, i] for i in range(3)]
-    normal = [geometry.normals[:, i] for i in range(3)]
     _, with_viewer = needs(scene.lights, reflectance.specular is not None)
-    to_viewer = _to_viewer(camera, position) if with_viewer else None
-    distance = _viewer_distance(scene.lights, camera, position)
-    surface = Surface(normal, position, to_viewer, distance)
+    corners = jnp.concatenate([geometry.positions, geometry.normals], axis=1)
     texel = texel_colors(scene, world.paints, geometry, points)
+
+    def shaded(reflectance: Reflectance, lights: tuple[Light, ...], corners: Array) -> Array:
+        columns = [corners[:, i] for i in range(6)]
+        position, normal = columns[:3], columns[3:]
+        to_viewer = _to_viewer(camera, position) if with_viewer else None
+        distance = _viewer_distance(scene.lights, camera, position)
+        surface = Surface(normal, position, to_viewer, distance)
+        return jnp.stack(phong(surface, reflectance, lights), axis=-1)
 
     def at_vertices(lights: tuple[Light, ...]) -> Columns:
         if texel is None:
@@ -143,8 +148,8 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
         return [c + s for c, s in zip(color, shine, strict=True)]
 
     def interpolated(reflectance: Reflectance, lights: tuple[Light, ...]) -> Columns:
-        color = phong(surface, reflectance, lights)
-        return at_points(jnp.stack(color, axis=-1), geometry, points)
+        color = where_finite(partial(shaded, reflectance, lights), corners)
+        return at_points(color, geometry, points)
 
     everywhere, alone = [], []
     for light, part in zip(scene.lights, reached, strict=True):

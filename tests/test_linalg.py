@@ -147,6 +147,21 @@ def test_normals_of_singular_transforms_are_finite():
         assert np.isfinite(gradient).all()
 
 
+def test_vectors_that_are_not_finite_spoil_no_derivative():
+    vectors = jnp.array([[1.0, 2.0, 3.0], [np.nan, 1.0, 1.0], [1.0, -np.inf, 1.0]])
+
+    def used(matrix, vectors):
+        moved = linalg.where_finite(lambda v: linalg.transform_points(matrix, v), vectors)
+        return jnp.sum(moved[:1]), moved
+
+    with_all = jax.grad(used, argnums=(0, 1), has_aux=True)
+    by_matrix, by_vectors = with_all(jnp.eye(4), vectors)[0]
+    np.testing.assert_array_equal(by_matrix[:3], [[1, 2, 3, 1]] * 3)
+    np.testing.assert_array_equal(by_vectors, [[1, 1, 1], [0, 0, 0], [0, 0, 0]])
+    moved = used(jnp.eye(4), vectors)[1]
+    np.testing.assert_array_equal(np.isnan(moved), [[False] * 3, [True] * 3, [True] * 3])
+
+
 @pytest.mark.parametrize("angle", [0, 1e-20, 1e-4, 0.01, 0.99, 1.01, 2.0, 3.1, np.pi - 1e-5, np.pi])
 def test_so3_exp_and_log(angle):
     axis = np.array([2.0, -3.0, 6.0]) / 7

@@ -257,6 +257,29 @@ def test_faces_with_numbers_that_are_not_finite_are_not_drawn(name, value):
     assert_same(fragments, renumbered(usual, 4 + np.arange(len(faces))))
 
 
+def test_any_corner_of_a_face_next_to_the_eye_may_be_the_first():
+    """Two corners a millionth from the eye, in its plane or behind it, and one far away."""
+    generator = np.random.default_rng(0)
+    corners = generator.normal(size=(300, 3, 4)).astype(np.float32)
+    corners[:, 1:] *= 1e-6
+    corners[..., 2] = 0.9 * corners[..., 3]
+
+    @jax.jit
+    @jax.vmap
+    def faces(positions):
+        turns = [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
+        return [rasterize(positions, jnp.array([f]), height=8, width=8).face for f in turns]
+
+    first, second, third = (np.asarray(image) for image in faces(corners))
+    np.testing.assert_array_equal(second, first)
+    np.testing.assert_array_equal(third, first)
+    assert 0.1 < np.mean(first == 0) < 0.5
+    for positions, image in zip(corners[:50].astype(float), first, strict=False):
+        want = reference.rasterize(positions, [[0, 1, 2]], 8, 8)
+        clear = want.edge_distance > 0.01
+        np.testing.assert_array_equal(image[clear], want.face[clear])
+
+
 def test_faces_without_area_are_not_drawn():
     inside = np.array([[-0.5, -0.5, 0, 1], [0.5, -0.5, 0, 1], [0.5, 0.5, 0, 1]])
     line = np.array([[-0.5, -0.5, 0, 1], [0, 0, 0, 1], [0.5, 0.5, 0, 1]])

@@ -295,6 +295,33 @@ def test_derivatives_in_everything_agree_to_second_order():
         np.testing.assert_allclose(curvature, difference, atol=1e-5 * np.abs(difference).max())
 
 
+@pytest.mark.parametrize("shading", ["phong", "gouraud"])
+def test_vertices_of_no_face_may_hold_anything(shading):
+    """The derivatives are those of the mesh without them, by what all vertices share, too."""
+    scene, camera = scenes.one_object(), scenes.perspective()
+    item = scene.objects[0]
+    mesh, beside = item.mesh, np.float32([[np.nan, 1, 1], [np.inf, -np.inf, 0], [1, 2, -np.inf]])
+    weights = jnp.asarray(NOISE)
+
+    @jax.jit
+    def gradient(vertices, normals):
+        def loss(vertices, normals, transform, camera):
+            mesh = dr.Mesh(vertices=vertices, faces=item.mesh.faces, normals=normals)
+            moved = replace(scene, objects=[dr.Object(mesh, item.material, transform)])
+            return jnp.vdot(weights, dr.render(moved, camera, settings(shading=shading)))
+
+        return jax.grad(loss, argnums=(0, 1, 2, 3))(vertices, normals, item.transform, camera)
+
+    want = gradient(mesh.vertices, mesh.normals)
+    got = gradient(*(np.concatenate([own, beside]) for own in (mesh.vertices, mesh.normals)))
+    for by_vertices in got[:2]:
+        np.testing.assert_array_equal(by_vertices[-3:], 0)
+    same = (got[0][:-3], got[1][:-3], *got[2:])
+    for one, other in zip(jax.tree.leaves(same), jax.tree.leaves(want), strict=True):
+        assert np.isfinite(one).all()
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
 # ------------------------------------------------------------------------------- only what is used
 
 

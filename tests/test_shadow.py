@@ -268,6 +268,17 @@ def test_batches_equal_single_views():
 # --------------------------------------------------------------------------------- degenerate input
 
 
+@pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types:FutureWarning")
+def test_outlines_are_found_in_float64_too():
+    with jax.enable_x64(True):
+        body = dr.shapes.cube()
+        scene = dr.Scene(objects=[dr.Object(body)], lights=[sun(), lamp((1.0, 2.0, 3.0))])
+        camera = dr.Camera.perspective(eye=(0, 1, 5), target=(0, 0, 0), fov_y=0.7, near=1, far=9)
+        options = dr.RenderSettings(height=8, width=8)
+        image = jax.eval_shape(lambda scene: dr.render(scene, camera, options), scene)
+        assert image.dtype == jnp.float64
+
+
 @pytest.fixture(scope="module")
 def pictures():
     """Picture and gradient as functions of where three lights are, and of the camera."""

@@ -445,7 +445,8 @@ def _with_rows(records: Records, used: Array, rows: tuple[Array, ...], first: Ar
     slot = records.total + ends - 1 - first
     slot = jnp.where(used & (slot >= 0), slot, capacity)
     columns = (
-        old.at[slot].set(new, mode="drop") for old, new in zip(records[1:], rows, strict=True)
+        old.at[slot].set(new.astype(old.dtype), mode="drop")
+        for old, new in zip(records[1:], rows, strict=True)
     )
     return Records(records.total + ends[-1], *columns)
 

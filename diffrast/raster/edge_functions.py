@@ -116,6 +116,7 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
     "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
     the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
     """
+    corners = _smallest_first(corners)
     scale = maximum3(list(_largest([corners.x, corners.y, corners.w])))
     inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
     points = [column * inverse_scale for column in (corners.x, corners.y, corners.w)]
@@ -170,6 +171,22 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
         extent(x_fixed, image.width),
         extent(y_fixed, image.height),
     )
+
+
+def _smallest_first(corners: Vertices) -> Vertices:
+    """The corners in the same cyclic order, the one with the smallest coordinates first.
+
+    Differences from the first corner are taken: from a large one they would lose all digits of
+    corners next to the eye.
+    """
+    size = _largest([corners.x, corners.y, corners.w])
+    first = jnp.argmin(size, axis=0)
+
+    def rolled(column: Array) -> Array:
+        second, third = (jnp.roll(column, -shift, axis=0) for shift in (1, 2))
+        return jnp.where(first == 0, column, jnp.where(first == 1, second, third))
+
+    return Vertices(*(rolled(column) for column in corners))
 
 
 def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image) -> Edge:

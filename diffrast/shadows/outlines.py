@@ -223,7 +223,7 @@ def _leaves(
         parts.append(jnp.where(b < 0, a / jnp.where(b < 0, a - b, 1), 3))
     part = jnp.minimum(jnp.minimum(parts[0], parts[1]), parts[2])
     corner = jnp.where(parts[0] == part, 0, jnp.where(parts[1] == part, 1, 2))
-    return stored((part, corner, volume))
+    return stored((part, corner.astype(jnp.int32), volume))
 
 
 def _follow(
@@ -246,7 +246,7 @@ def _follow(
         return stored((jnp.where(done, face, following), next_edge, turn, found, done))
 
     nothing = jnp.zeros_like(face)
-    start = face, nothing - 1, nothing.astype(jnp.float32), face < -1, face < 0
+    start = face, nothing - 1, jnp.zeros_like(ends[0][0]), face < -1, face < 0
     _, edge, _, found, _ = lax.fori_loop(0, _STEPS, step, start)
     return stored(jnp.where(found, _named_once(edge, neighbors), -1))
 
