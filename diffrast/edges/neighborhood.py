@@ -70,15 +70,15 @@ def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
 
 
 def walk(
-    face: Int[Array, "*n"],
-    x: Float[Array, "*n"],
-    y: Float[Array, "*n"],
+    face: Int[Array, "ways n"],
+    x: Float[Array, " n"],
+    y: Float[Array, " n"],
     faces: Int[Array, "F 3"],
     pixels: Table,
     neighbors: Int[Array, "F 3"],
     volume: Float[Array, " F"],
-) -> tuple[Int[Array, "*n"], Bool[Array, "*n"]]:
-    """The faces that cover points, found from other faces on the way towards these.
+) -> tuple[Int[Array, "ways n"], Bool[Array, "ways n"]]:
+    """The faces that cover points, found from other faces on ways towards these.
 
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or
     turns away. Also whether the end of the way was reached.

@@ -167,8 +167,7 @@ def look(
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
-    inside = stored(jnp.minimum(_BEFORE, thickness / 2))
-    offset = jnp.stack([-inside * out, _BEYOND * out], axis=1)
+    offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
     values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
@@ -226,22 +225,19 @@ def look(
     above = tiny & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
-    # Two walks over the surface: to the point just inside, from where a surface is seen that would
-    # hide the piece if it reached it; and where nothing is found behind, to the point just beyond,
-    # from what is seen there. If that ends before, and there are empty pixels not far away, the
-    # background is bare.
+    # Two walks over the surface to the point just beyond: from where a surface is seen that would
+    # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond.
+    # If that ends before, and there are empty pixels not far away, the background is bare.
     before = fold & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     search = fold & ~found
     bare = pictured < 0
     shown = picked(pictured, beyond_look)
     leave = jnp.stack([_seen_nearest(before, pictured, middle), jnp.where(search, shown, -1)])
-    distance = jnp.stack([-inside, jnp.full_like(inside, _BEYOND)])
-    aim = (centre + middle)[:, None] + distance * out[:, None]
-    leave, aim = stored((leave, aim))
-    reached, there = walk(leave, aim[0], aim[1], faces, pixels, topology.neighbors, volume)
+    leave, (x, y) = stored((leave, centre + middle + _BEYOND * out))
+    reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
     reached = stored(jnp.where(arrives | (leave >= 0), reached, beyond))
-    values, reached_depth = edge_values(corners_of(reached, faces, pixels), aim[0], aim[1])
+    values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
     foreign = (reached != own[0]) & (reached != own[1])
     hides = stored(arrives & foreign & (reached_depth > near * (1 + FINE_TOLERANCE)))
     visible = visible & ~hides[0] & ~hides[1]
