@@ -2,8 +2,10 @@
 
 Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it and
 those round the edge itself. The first part of the piece is looked at here (see `parts`); what is
-left of it becomes a piece of its own. Where no candidate lies behind the part, a walk over the
-surface at the next pixel beyond tells which of its faces does, or that it ends before.
+left of it becomes a piece of its own. Faces may be too thin for any pixel to show them: a walk over
+the surface that is seen nearby, and would hide the part if it reached it, tells whether it does.
+Where no candidate lies behind the part, a walk over the surface at the next pixel beyond tells
+which of its faces does, or that it ends before.
 """
 
 from typing import NamedTuple
