@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -223,6 +223,16 @@ def pyplot() -> ModuleType:
     import matplotlib.pyplot as plt
 
     return plt
+
+
+def progress_bar(items: Iterable[Any] | None = None, **options: Any) -> Any:
+    """A bar of tqdm's for what scripts show unless they are told `--quiet`."""
+    try:
+        from tqdm.auto import tqdm
+    except ImportError as error:
+        message = "progress needs tqdm: install diffrast[progress], or pass --quiet"
+        raise SystemExit(message) from error
+    return tqdm(items, **options)
 
 
 def save_comparison(

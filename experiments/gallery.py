@@ -23,6 +23,7 @@ import gallery_drawings
 import gallery_scenes
 import gallery_textures
 import numpy as np
+from common import progress_bar
 from PIL import Image, ImageDraw
 
 import diffrast as dr
@@ -85,12 +86,7 @@ def _with_progress(chosen: list[Picture], progress: bool) -> Iterator[Picture]:
     if not progress:
         yield from chosen
         return
-    try:
-        from tqdm.auto import tqdm
-    except ImportError as error:
-        message = "progress needs tqdm: install diffrast[progress], or pass --quiet"
-        raise ImportError(message) from error
-    with tqdm(chosen) as bar:
+    with progress_bar(chosen) as bar:
         for picture in bar:
             bar.set_description(picture.name)
             yield picture

@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import load_mesh, save_json
+from common import load_mesh, progress_bar, save_json
 from jax import Array
 
 import diffrast as dr
@@ -185,13 +185,7 @@ def main() -> None:
     options = parser.parse_args()
     bar = None
     if not options.quiet:
-        try:
-            from tqdm.auto import tqdm
-        except ImportError as error:
-            raise SystemExit(
-                "progress needs tqdm: install diffrast[progress], or pass --quiet"
-            ) from error
-        bar = tqdm(total=options.views, unit="view")
+        bar = progress_bar(total=options.views, unit="view")
 
     def told(bar: Any, done: int, per_second: float) -> None:
         bar.update(done - bar.n)

@@ -35,7 +35,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import stress_scenes
-from common import pyplot, save_json
+from common import progress_bar, pyplot, save_json
 from stress_measures import GROUPS, Group, Measures, failures, float64_measures, measured, picture
 from stress_scenes import CONTINUOUS, NAMES, Case, Parts
 
@@ -86,7 +86,7 @@ def run(
     rows: list[Row] = []
     saved: dict[str, str] = {}
     repeat: list[tuple[list[Row], Parts, np.ndarray]] = []
-    for name, cases, compare in _with_bar(jobs) if progress else jobs:
+    for name, cases, compare in progress_bar(jobs, unit="batch") if progress else jobs:
         parts = stress_scenes.stacked([case.parts for case in cases])
         measures, images = measured(name, parts, size, compare=compare)
         new = [{"group": name, "stressor": c.stressor, "magnitude": c.magnitude} for c in cases]
@@ -119,15 +119,6 @@ def run(
     save_json(out / "stability.json", report)
     plot(report, out / "stability.png")
     return report
-
-
-def _with_bar(jobs: list[Any]) -> Iterable[Any]:
-    try:
-        from tqdm.auto import tqdm
-    except ImportError as error:
-        message = "progress needs tqdm: install diffrast[progress], or pass --quiet"
-        raise SystemExit(message) from error
-    return tqdm(jobs, unit="batch")
 
 
 def _extend(rows: list[Row], measures: Measures) -> None:

@@ -10,7 +10,6 @@ which adds up exactly over the pieces of any outline. To first order dS is minus
 times the motion of its middle: linear in the positions, without a singularity.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -468,8 +467,7 @@ def _along(
     far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
     far = jnp.where(bends, far, bend)
     # A shadow may begin where the slope is taken.
-    colors = front, bend, far, inner
-    most = 2 * (functools.reduce(jnp.maximum, colors) - functools.reduce(jnp.minimum, colors))
+    most = 2 * jnp.ptp(jnp.stack([front, bend, far, inner]), axis=0)
     rise = jnp.clip(depth * (inner - beside) / BESIDE, -most, most)
     # Seen from ever flatter above, it changes with the square root of the depth.
     mean = jnp.where(rim.single, 1 / 2, 2 / 3)[:, None]

@@ -224,28 +224,29 @@ def look(
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
     tiny = stored(area(corners_of(pictured, faces, pixels))) < _FINE
-    above = tiny & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
+    before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
+    above = tiny & before
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # Two walks over the surface to the point just beyond: from where a surface is seen that would
     # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond.
     # If that ends before, and there are empty pixels not far away, the background is bare.
-    before = fold & foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     search = fold & ~found
     bare = pictured < 0
     shown = picked(pictured, beyond_look)
-    leave = jnp.stack([_seen_nearest(before, pictured, middle), jnp.where(search, shown, -1)])
+    start = _seen_nearest(fold & before, pictured, middle)
+    leave = jnp.stack([start, jnp.where(search, shown, -1)])
     leave, (x, y) = stored((leave, centre + middle + _BEYOND * out))
     reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
     reached = stored(jnp.where(arrives | (leave >= 0), reached, beyond))
     values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
-    foreign = (reached != own[0]) & (reached != own[1])
-    hides = stored(arrives & foreign & (reached_depth > near * (1 + FINE_TOLERANCE)))
-    visible = visible & ~hides[0] & ~hides[1]
+    hides = arrives & (reached != own[0]) & (reached != own[1])
+    hides = stored(hides & (reached_depth > near * (1 + FINE_TOLERANCE)))
+    visible = visible & ~jnp.any(hides, axis=0)
     lies = arrives[1] & ~hides[1]
-    gap = search & there[1] & (reached[1] < 0) & (shown >= 0)
-    gap = gap & is_bare_near(bare_blocks, pieces.pixel[0], pieces.pixel[1])
+    stops = search & there[1] & (reached[1] < 0) & (shown >= 0)
+    gap = stops & is_bare_near(bare_blocks, *pieces.pixel)
     at_beyond = barycentrics([value[1] for value in values])
     beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached[1], beyond)))
     bare_look = first_row(bare)

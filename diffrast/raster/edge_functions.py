@@ -116,8 +116,8 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
     "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
     the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
     """
-    corners = _smallest_first(corners)
-    scale = maximum3(list(_largest([corners.x, corners.y, corners.w])))
+    sizes = _largest([corners.x, corners.y, corners.w])
+    corners, scale = _smallest_first(corners, sizes), maximum3(list(sizes))
     inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
     points = [column * inverse_scale for column in (corners.x, corners.y, corners.w)]
     # (v_1 - v_0) × (v_2 - v_0), v_2 × v_0 and v_0 × v_1, for each the three components.
@@ -173,14 +173,13 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
     )
 
 
-def _smallest_first(corners: Vertices) -> Vertices:
-    """The corners in the same cyclic order, the one with the smallest coordinates first.
+def _smallest_first(corners: Vertices, sizes: Array) -> Vertices:
+    """The corners in the same cyclic order, the one of the smallest size first.
 
     Differences from the first corner are taken: from a large one they would lose all digits of
     corners next to the eye.
     """
-    size = _largest([corners.x, corners.y, corners.w])
-    first = jnp.argmin(size, axis=0)
+    first = jnp.argmin(sizes, axis=0)
 
     def rolled(column: Array) -> Array:
         second, third = (jnp.roll(column, -shift, axis=0) for shift in (1, 2))
