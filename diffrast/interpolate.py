@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._check import ArrayInput, float_array, index_array, positive_int
-from diffrast._stored import assemble
+from diffrast._stored import assemble, stored
 from diffrast.raster import Fragments
 from diffrast.raster.evaluate import blend, corners_at
 
@@ -172,13 +172,13 @@ def slopes_at(
         barycentrics: of the point there.
         values: of the attributes there.
     """
-    rows = slopes[jnp.maximum(face, 0)]
     count = len(values)
-    limit = 1 / jnp.finfo(rows.dtype).eps ** 2
-    w = sum(barycentrics[j] * rows[..., 2 * count + 2 + j] for j in range(3))
+    columns = [slopes[:, i][jnp.maximum(face, 0)] for i in range(slopes.shape[1])]
+    limit = 1 / jnp.finfo(slopes.dtype).eps ** 2
+    w = stored(sum(barycentrics[j] * columns[2 * count + 2 + j] for j in range(3)))
     return [
         [
-            w * (rows[..., k * count + c] - jnp.clip(t, -limit, limit) * rows[..., 2 * count + k])
+            w * (columns[k * count + c] - jnp.clip(t, -limit, limit) * columns[2 * count + k])
             for k in range(2)
         ]
         for c, t in enumerate(values)

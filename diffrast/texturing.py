@@ -179,6 +179,7 @@ def _group_colors(group: _Group, paint: Paint, geometry: Geometry, points: Point
         which = stored(table[geometry.object_of_face[jnp.maximum(points.face, 0)]])
     columns = [paint.attributes[:, i] for i in range(paint.attributes.shape[1])]
     found = interpolate_columns(columns, paint.corners, points.face, points.barycentrics)
+    found = stored(found)  # else all corners' are kept until the slopes are there
     at: Columns = stored(coordinates(kind.mapping, found))
     slopes = None
     if paint.slopes is not None:
