@@ -87,6 +87,23 @@ def test_forward_mode_equals_reverse_mode_to_second_order(gradients):
     np.testing.assert_allclose(product, difference, rtol=2e-2, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types:FutureWarning")
+def test_both_precisions_in_one_process():
+    """With everything that has tables of its own: bodies that may pierce each other, and shadows."""
+
+    def shape():
+        cubes = [dr.Object(dr.shapes.cube()), dr.Object(dr.shapes.cube(), transform=jnp.eye(4) / 2)]
+        sun = dr.DirectionalLight(direction=(1, -2, -1), shadow=dr.Shadow(resolution=16))
+        scene = dr.Scene(objects=cubes, lights=[sun])
+        eye = jnp.array([3.0, 2.0, 4.0])
+        return jax.eval_shape(lambda: dr.render(scene, camera(eye), dr.RenderSettings(**SIZE)))
+
+    assert shape().dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert shape().dtype == jnp.float64
+    assert shape().dtype == jnp.float32
+
+
 def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
     """On the stage alone: faces of one colour each, which changes with the eye."""
 

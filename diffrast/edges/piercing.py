@@ -34,7 +34,8 @@ _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
 
 _FACES = 9 + 2 * 3
-_ONE, _OTHER = np.array(list(itertools.combinations(range(_FACES), 2))).T
+# Of 32 bits: JAX refuses others where they were used before in a different precision.
+_ONE, _OTHER = np.array(list(itertools.combinations(range(_FACES), 2)), np.int32).T
 
 
 class _Planes(NamedTuple):

@@ -35,7 +35,7 @@ _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 _RIGHT = [(0, 3 * row + k, 3 * row + k + 1) for row, k in itertools.product(range(3), range(2))]
 _BELOW = [(1, 3 * row + k, 3 * row + k + 3) for row, k in itertools.product(range(2), range(3))]
 _DIRECTION, _FIRST, _SECOND = np.array(
-    sorted(_RIGHT + _BELOW, key=lambda pair: 4 not in pair[1:])
+    sorted(_RIGHT + _BELOW, key=lambda pair: 4 not in pair[1:]), np.int32
 ).T
 
 
