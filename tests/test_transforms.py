@@ -89,7 +89,7 @@ def test_forward_mode_equals_reverse_mode_to_second_order(gradients):
 
 @pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types:FutureWarning")
 def test_both_precisions_in_one_process():
-    """With everything that has tables of its own: bodies that may pierce each other, and shadows."""
+    """With all that has tables of its own: bodies that may pierce each other, and shadows."""
 
     def shape():
         cubes = [dr.Object(dr.shapes.cube()), dr.Object(dr.shapes.cube(), transform=jnp.eye(4) / 2)]
