@@ -4,7 +4,9 @@ Shapes and dtypes are checked always, also while tracing. Values (finite numbers
 can only be checked where they are known: a traced array passes.
 """
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
@@ -39,13 +41,11 @@ def float_array(
     Raises:
         ValueError: for anything that is not an array of real numbers of that shape.
     """
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{name}: wanted an array of numbers, got {_brief(value)} ({error})"
-        ) from error
-    if array.dtype == bool or jnp.issubdtype(array.dtype, jnp.complexfloating):
+    if isinstance(value, np.ndarray | np.generic) and np.issubdtype(value.dtype, np.integer):
+        value = value.astype(np.float64)  # JAX would drop the upper half of 64 bits
+    array = _array(name, value, "numbers")
+    is_real = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+    if not is_real:
         raise ValueError(f"{name}: wanted real numbers, got dtype {array.dtype}")
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(jnp.result_type(float))
@@ -67,17 +67,13 @@ def index_array(
     name: str, value: Any, shape: tuple[int | str, ...], *, minimum: int = 0, bound: int
 ) -> Array:
     """Convert to int32 and check that every index lies in [minimum, bound)."""
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{name}: wanted an array of integers, got {_brief(value)} ({error})"
-        ) from error
+    given = value if isinstance(value, np.ndarray | np.generic) else None
+    array = _array(name, value, "integers")
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name}: wanted integers, got dtype {array.dtype}")
     _check_shape(name, array.shape, shape)
     if is_concrete(array) and array.size:
-        numbers = np.asarray(array)
+        numbers = np.asarray(array) if given is None else given  # JAX cuts off 64 bits
         bad = np.argwhere((numbers < minimum) | (numbers >= bound))
         if len(bad):
             where = tuple(int(i) for i in bad[0])
@@ -105,11 +101,35 @@ def positive_int(name: str, value: Any, *, minimum: int = 1) -> int:
     return int(value)
 
 
+def file_path(name: str, value: Any) -> Path:
+    """Check what should be the name of a file, there or not."""
+    try:
+        path = Path(value)
+        if b"\0" in os.fsencode(path):
+            raise ValueError("embedded null character")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}: wanted the name of a file, got {_brief(value)} ({error})"
+        ) from error
+    return path
+
+
 def one_of(name: str, value: Any, choices: tuple[str, ...]) -> str:
     """Check a choice by name."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: wanted one of {', '.join(choices)}, got {_brief(value)}")
     return value
+
+
+def _array(name: str, value: Any, wanted: str) -> Array:
+    try:
+        with np.errstate(over="ignore"):  # infinity is dealt with as such
+            return jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        reason = str(error).split("\n")[0]
+        raise ValueError(
+            f"{name}: wanted an array of {wanted}, got {_brief(value)} ({reason})"
+        ) from error
 
 
 def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...] | None) -> None:
@@ -128,5 +148,8 @@ def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...] 
 
 
 def _brief(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except Exception:  # also of lists nested too deep
+        text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffrast._check import file_path
 from diffrast.shapes.bezier import BezierPatches, parse_bezier
 
 
@@ -19,7 +20,7 @@ def load_bezier(path: str | Path) -> BezierPatches:
         OSError: when the file cannot be opened.
     """
     # Comments may hold letters of any encoding; the numbers are ASCII.
-    return parse_bezier(Path(path).read_text(encoding="latin-1"), str(path))
+    return parse_bezier(file_path("path", path).read_text(encoding="latin-1"), str(path))
 
 
 def save_bezier(path: str | Path, patches: BezierPatches) -> None:
@@ -32,7 +33,7 @@ def save_bezier(path: str | Path, patches: BezierPatches) -> None:
         lines.append(f"{number} {_digits(x)} {_digits(y)} {_digits(z)}")
     for number, (surface, row) in enumerate(zip(surfaces, indices, strict=True)):
         lines.append(f"{number} {surface} 16 " + " ".join(map(str, row)))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _digits(value: np.floating) -> str:
