@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast import linalg, viewing
-from diffrast._check import file_path, one_of
+from diffrast._check import file_path, float_array, one_of
 from diffrast.camera import Camera
 from diffrast.files._folder import inside
 from diffrast.files.bezier import load_bezier
@@ -171,7 +171,7 @@ def _mesh_of(path: Path) -> tuple[Mesh, np.ndarray]:
 def _camera(file: SceneFile, objects: list[Object]) -> Camera:
     """The file's view, deep enough for all objects."""
     axes = viewing.view_axes([-x for x in file.view_plane_normal], file.view_up)
-    origin = jnp.asarray(file.view_reference_point)
+    origin = float_array("view_reference_point", file.view_reference_point, (3,))
     depths = [
         (linalg.transform_points(item.transform, item.mesh.vertices) - origin) @ axes[2]
         for item in objects

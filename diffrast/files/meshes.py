@@ -7,6 +7,7 @@ checks text formats first.
 
 import io
 import logging
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -161,8 +162,11 @@ def _checked(
         check_off(text_of(content, name), name)
     elif suffix == ".ply":
         check_ply(content, name)
-        header = content.partition(b"end_header")[0]
-        return content, {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
+        header, end, body = content.partition(b"end_header")
+        # trimesh makes paths of edges, in memory that grows with the largest index, and no faces.
+        header = re.sub(rb"element\s+edge\b", b"element lines", header)
+        options = {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
+        return header + end + body, options
     elif suffix == ".stl" and len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
         check_ascii_stl(text_of(content, name), name)
     return content, {}
