@@ -67,13 +67,13 @@ def index_array(
     name: str, value: Any, shape: tuple[int | str, ...], *, minimum: int = 0, bound: int
 ) -> Array:
     """Convert to int32 and check that every index lies in [minimum, bound)."""
-    given = value if isinstance(value, np.ndarray | np.generic) else None
     array = _array(name, value, "integers")
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name}: wanted integers, got dtype {array.dtype}")
     _check_shape(name, array.shape, shape)
     if is_concrete(array) and array.size:
-        numbers = np.asarray(array) if given is None else given  # JAX cuts off 64 bits
+        is_wide = isinstance(value, np.ndarray | np.generic)  # JAX cuts off 64 bits
+        numbers = np.asarray(value if is_wide else array)
         bad = np.argwhere((numbers < minimum) | (numbers >= bound))
         if len(bad):
             where = tuple(int(i) for i in bad[0])
@@ -94,11 +94,51 @@ def real_number(name: str, value: Any, *, above: float = -np.inf, below: float =
     return number
 
 
-def positive_int(name: str, value: Any, *, minimum: int = 1) -> int:
-    """Check a static count or size."""
+def distance(name: str, value: Any) -> float:
+    """Check a known number of at least 0."""
+    number = float(float_array(name, value, ()))
+    if number < 0:
+        raise ValueError(f"{name}: wanted a distance of at least 0, got {number}")
+    return number
+
+
+def positive_int(name: str, value: Any, *, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
+    """Check a static count or size; what counts pixels or vertices has 32 bits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValueError(f"{name}: wanted an integer of at least {minimum}, got {_brief(value)}")
+    if value > maximum:
+        raise ValueError(f"{name}: wanted an integer of at most {maximum}, got {_brief(value)}")
     return int(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Check a static yes or no."""
+    if not isinstance(value, bool | np.bool | int | np.integer) or value not in (0, 1):
+        raise ValueError(f"{name}: wanted True or False, got {_brief(value)}")
+    return bool(value)
+
+
+def instance_of(name: str, value: Any, *kinds: type) -> None:
+    """Check that an object is one of the library's."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{name}: wanted a {wanted}, got {type(value).__name__}")
+
+
+def all_instances(name: str, values: Any, kind: type) -> None:
+    """Check a sequence of objects of the library's."""
+    if not isinstance(values, Sequence):
+        raise ValueError(f"{name}: wanted a list, got {type(values).__name__}")
+    for number, value in enumerate(values):
+        instance_of(f"{name}[{number}]", value, kind)
+
+
+def array_tree(name: str, tree: Any) -> None:
+    """Check a tree of arrays and numbers of any kind."""
+    for leaf in jax.tree.leaves(tree):
+        foreign = isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind not in "biufcV"
+        if foreign or not isinstance(leaf, Array | np.ndarray | np.generic | int | float | complex):
+            raise ValueError(f"{name}: wanted a tree of arrays, got {_brief(leaf)} in it")
 
 
 def file_path(name: str, value: Any) -> Path:

@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast import linalg, viewing
-from diffrast._check import file_path, float_array, one_of
+from diffrast._check import file_path, flag, float_array, one_of
 from diffrast.camera import Camera
 from diffrast.files._folder import inside
 from diffrast.files.bezier import load_bezier
@@ -85,8 +85,12 @@ def render_scene_file(
         ValueError: as `read_scene`, and for an unknown operation.
         OSError: when a file cannot be opened.
     """
+    if operation is not None:
+        one_of("operation", operation, OPERATIONS)
+    antialias = flag("antialias", antialias)
     file = read_scene(path)
-    operation = one_of("operation", operation or file.description.operation, OPERATIONS)
+    if operation is None:
+        operation = file.description.operation
     height, width = file.height, file.width
     if operation in ("phong", "gouraud"):
         settings = RenderSettings(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffrast._check import file_path
+from diffrast._check import file_path, instance_of
 from diffrast.shapes.bezier import BezierPatches, parse_bezier
 
 
@@ -24,7 +24,13 @@ def load_bezier(path: str | Path) -> BezierPatches:
 
 
 def save_bezier(path: str | Path, patches: BezierPatches) -> None:
-    """Write bicubic patches; reading them gives the same numbers back."""
+    """Write bicubic patches; reading them gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but patches.
+        OSError: when the file cannot be written.
+    """
+    instance_of("patches", patches, BezierPatches)
     points = np.asarray(patches.points)
     surfaces = np.asarray(patches.surfaces)
     indices = np.asarray(patches.indices).reshape(len(surfaces), 16)

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float32, UInt8
 from PIL import Image, ImageFile, ImageOps
 
-from diffrast._check import ArrayInput, file_path, float_array, real_number
+from diffrast._check import ArrayInput, file_path, flag, float_array, real_number
 from diffrast.color import linear_to_srgb, srgb_to_linear
 
 
@@ -31,7 +31,7 @@ def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height
         ValueError: with the file's name, for a file that cannot be read as an image.
         FileNotFoundError: for a file that is not there.
     """
-    path = file_path("path", path)
+    path, srgb = file_path("path", path), flag("srgb", srgb)
     try:
         with Image.open(path) as image:
             check_picture(image)
@@ -62,7 +62,7 @@ def save_image(path: str | Path, image: ArrayInput, *, srgb: bool = True) -> Non
             infinity, and formats that Pillow cannot write.
         FileNotFoundError: for a folder that is not there.
     """
-    path = file_path("path", path)
+    path, srgb = file_path("path", path), flag("srgb", srgb)
     _write(path, [Image.fromarray(_to_bytes("image", image, srgb))])
 
 
@@ -88,9 +88,11 @@ def save_animation(
     rate = float(real_number("frames_per_second", frames_per_second, above=0.0))
     if rate > 100:
         raise ValueError(f"frames_per_second: wanted at most 100, got {rate:g}")
-    path = file_path("path", path)
+    path, srgb = file_path("path", path), flag("srgb", srgb)
     if path.suffix.lower() != ".gif":
         raise ValueError(f"path: wanted a name that ends in .gif, got {path}")
+    if not isinstance(images, Iterable):
+        raise ValueError(f"images: wanted a list of images, got {type(images).__name__}")
     frames = [_to_bytes(f"images[{i}]", image, srgb) for i, image in enumerate(images)]
     for index, frame in enumerate(frames):
         if frame.shape != frames[0].shape:
@@ -164,10 +166,10 @@ def _unit(values: np.ndarray, full: int) -> np.ndarray:
 
 
 def _to_bytes(name: str, image: ArrayInput, srgb: bool) -> UInt8[np.ndarray, "height width *c"]:
+    values = float_array(name, image)
     dtype = jnp.result_type(image) if hasattr(image, "dtype") else np.asarray(image).dtype
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(f"{name}: wanted floating-point values from 0 to 1, got dtype {dtype}")
-    values = float_array(name, image)
     channels = values.shape[2:] or (1,)
     if values.ndim not in (2, 3) or values.size == 0 or channels not in ((1,), (3,), (4,)):
         raise ValueError(

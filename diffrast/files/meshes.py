@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from diffrast._check import file_path
+from diffrast._check import file_path, instance_of
 from diffrast.color import srgb_to_linear
 from diffrast.files import _gltf
 from diffrast.files._folder import Neighbors
@@ -106,6 +106,7 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
         OSError: when the file cannot be written.
     """
     path = file_path("path", path)
+    instance_of("mesh", mesh, Mesh)
     suffix = _known_suffix(path)
     if suffix == ".obj":
         path.write_text(_obj_text(mesh), encoding="ascii")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from diffrast._check import file_path
+from diffrast._check import file_path, instance_of
 from diffrast._tokens import Tokens
 from diffrast.mesh import Mesh, from_polygons
 
@@ -108,7 +108,13 @@ def load_polygons(path: str | Path) -> Polygons:
 
 
 def save_polygons(path: str | Path, polygons: Polygons) -> None:
-    """Write an object; reading it gives the same numbers back."""
+    """Write an object; reading it gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but polygons.
+        OSError: when the file cannot be written.
+    """
+    instance_of("polygons", polygons, Polygons)
     surfaces = np.asarray(polygons.surfaces)
     lines = [f"{len(polygons.points)} {len(polygons.polygons)} {surfaces.max() + 1}"]
     for number, point in enumerate(np.asarray(polygons.points)):
@@ -181,7 +187,13 @@ def load_scene_file(path: str | Path) -> SceneFile:
 
 
 def save_scene_file(path: str | Path, scene: SceneFile) -> None:
-    """Write a scene; reading it gives the same numbers back."""
+    """Write a scene; reading it gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but a scene file.
+        OSError: when the file cannot be written.
+    """
+    instance_of("scene", scene, SceneFile)
 
     def row(*numbers: float, comment: str) -> str:
         return " ".join(f"{number:.17g}" for number in numbers) + f" {{{comment}}}"

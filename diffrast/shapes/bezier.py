@@ -99,6 +99,8 @@ def bezier_mesh(
     """
     control = _check.float_array("control_points", control_points, ("patches", 4, 4, 3))
     columns, rows = two_counts("divisions", divisions)
+    if merge_tolerance is not None:
+        _check.distance("merge_tolerance", merge_tolerance)
     # u and 1 − u both rounded once: exact mirror images, as u and v are on edges that meet.
     uvs, mirrored = grid_uvs(columns, rows), grid_uvs(columns, rows)[::-1]
     parameters = (uvs[:, 0], mirrored[:, 0], uvs[:, 1], mirrored[:, 1])
@@ -130,6 +132,7 @@ def parse_bezier(text: str, name: str = "text") -> BezierPatches:
     Raises:
         ValueError: naming `name` and the line, for anything else.
     """
+    _check.instance_of("text", text, str)
     tokens = Tokens(text, name)
     points = tokens.integer("the number of control points", 1)
     patches = tokens.integer("the number of patches", 1)
