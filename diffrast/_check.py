@@ -133,6 +133,14 @@ def all_instances(name: str, values: Any, kind: type) -> None:
         instance_of(f"{name}[{number}]", value, kind)
 
 
+def iterable(name: str, value: Any, wanted: str) -> None:
+    """Check what has one entry after another."""
+    try:
+        iter(value)
+    except TypeError as error:
+        raise ValueError(f"{name}: wanted {wanted}, got {_brief(value)}") from error
+
+
 def array_tree(name: str, tree: Any) -> None:
     """Check a tree of arrays and numbers of any kind."""
     for leaf in jax.tree.leaves(tree):

@@ -13,6 +13,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast import _check
+
 
 class EdgeAdjacency(NamedTuple):
     """Every edge once, with the faces that meet there; all arrays are int32.
@@ -299,8 +301,7 @@ def join_indices(polygons: Sequence[Any] | np.ndarray, bound: int) -> tuple[np.n
     Raises:
         ValueError: for anything but lists of ids in [0, bound).
     """
-    if not isinstance(polygons, Sequence | np.ndarray):
-        raise ValueError(f"polygons: wanted lists of vertex ids, got {type(polygons).__name__}")
+    _check.iterable("polygons", polygons, "lists of vertex ids")
     try:
         lists = [np.asarray(polygon) for polygon in polygons]
     except ValueError as error:

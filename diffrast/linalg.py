@@ -79,6 +79,8 @@ def null_vector(rows: Float[Array, "3 4"]) -> Float[Array, "4"]:
 
 
 def _scale_to_unit_box(vectors: Array) -> tuple[Array, Array]:
+    if vectors.shape[-1] == 0:
+        raise ValueError(f"vectors: wanted at least one component, got shape {vectors.shape}")
     """Divide by the largest magnitude, so that squares neither over- nor underflow.
 
     Zero vectors become ones, for the caller to select away. The magnitude (last axis kept, of

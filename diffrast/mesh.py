@@ -255,12 +255,16 @@ def from_polygons(
     _check.one_of("weighting", weighting, ("uniform", "area"))
     positions = np.asarray(positions_device, dtype=np.float64)
     corners, sizes = _topology.join_indices(polygons, len(positions))
-    group = np.zeros(len(sizes), dtype=int) if surfaces is None else np.asarray(surfaces)
+    try:
+        group = np.zeros(len(sizes), dtype=int) if surfaces is None else np.asarray(surfaces)
+    except ValueError as error:
+        raise ValueError(f"surfaces: wanted an integer for each polygon ({error})") from error
     if group.shape != sizes.shape or not np.issubdtype(group.dtype, np.integer):
         raise ValueError(
             f"surfaces: wanted an integer for each of {len(sizes)} polygons, got shape"
             f" {group.shape}, dtype {group.dtype}"
         )
+    group = group.astype(np.int64)  # next to which others would become floats
     joined = _topology.join_polygons(positions, corners, sizes)
     triangles = _topology.triangulate(positions, joined)
     # One vertex for every vertex id and surface that occur together.
@@ -377,6 +381,9 @@ def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
     Args:
         mesh: positions must be known, not traced.
         tolerance: distance in the unit of the vertices; 0 merges equal positions only.
+
+    Raises:
+        ValueError: for a traced mesh, and a tolerance below 0 or one that leaves no face.
     """
     _check.instance_of("mesh", mesh, Mesh)
     distance = _check.distance("tolerance", tolerance)
@@ -385,6 +392,8 @@ def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
     corners = leader[faces]
     proper = np.all(corners != np.roll(corners, 1, axis=1), axis=1)
     corners = corners[proper]
+    if len(corners) == 0:
+        raise ValueError(f"tolerance: wanted one that leaves a face, got {distance}")
     used, first_use, index = np.unique(corners, return_index=True, return_inverse=True)
     order = np.argsort(first_use)
     kept = used[order]

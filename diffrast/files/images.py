@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float32, UInt8
 from PIL import Image, ImageFile, ImageOps
 
-from diffrast._check import ArrayInput, file_path, flag, float_array, real_number
+from diffrast._check import ArrayInput, file_path, flag, float_array, iterable, real_number
 from diffrast.color import linear_to_srgb, srgb_to_linear
 
 
@@ -91,8 +91,7 @@ def save_animation(
     path, srgb = file_path("path", path), flag("srgb", srgb)
     if path.suffix.lower() != ".gif":
         raise ValueError(f"path: wanted a name that ends in .gif, got {path}")
-    if not isinstance(images, Iterable):
-        raise ValueError(f"images: wanted a list of images, got {type(images).__name__}")
+    iterable("images", images, "a list of images")
     frames = [_to_bytes(f"images[{i}]", image, srgb) for i, image in enumerate(images)]
     for index, frame in enumerate(frames):
         if frame.shape != frames[0].shape:

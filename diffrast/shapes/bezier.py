@@ -98,6 +98,8 @@ def bezier_mesh(
             merges nothing.
     """
     control = _check.float_array("control_points", control_points, ("patches", 4, 4, 3))
+    if control.shape[0] == 0:
+        raise ValueError("control_points: wanted at least one patch, got none")
     columns, rows = two_counts("divisions", divisions)
     if merge_tolerance is not None:
         _check.distance("merge_tolerance", merge_tolerance)
