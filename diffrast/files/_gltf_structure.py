@@ -10,6 +10,18 @@ from typing import Any
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _UNSIGNED = (5121, 5123, 5125)
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_LISTS = (
+    "accessors",
+    "bufferViews",
+    "buffers",
+    "images",
+    "materials",
+    "meshes",
+    "nodes",
+    "samplers",
+    "scenes",
+    "textures",
+)
 _DRACO = "KHR_draco_mesh_compression"
 
 
@@ -19,21 +31,21 @@ def check_structure(tree: dict[str, Any]) -> None:
     Raises:
         ValueError: for anything that glTF does not allow, without the file's name.
     """
+    for key in _LISTS:
+        _check_list(tree, key)
     for number in range(len(entries(tree, "bufferViews"))):
         _check_view(tree, number)
     for number in range(len(entries(tree, "accessors"))):
         _check_accessor(tree, number)
     for number, mesh in enumerate(entries(tree, "meshes")):
-        for primitive in entries(mesh, "primitives", f"meshes[{number}]: "):
+        for primitive in _check_list(mesh, "primitives", f"meshes[{number}]: "):
             _check_primitive(tree, primitive, f"meshes[{number}]")
     _check_nodes(tree)
 
 
-def entries(tree: dict[str, Any], key: str, where: str = "") -> list[Any]:
-    """A list of objects, empty if it is not there."""
-    found = tree.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
-        raise ValueError(f"{where}{key}: wanted a list of objects, got {found!r:.40}")
+def entries(tree: dict[str, Any], key: str) -> list[Any]:
+    """One of the file's lists of objects, empty if it is not there; checked once for all."""
+    found: list[Any] = tree.get(key, [])
     return found
 
 
@@ -44,6 +56,13 @@ def check_index(name: str, index: Any, found: list[Any]) -> None:
 
 
 # --------------------------------------------------------------------------------------- details
+
+
+def _check_list(tree: dict[str, Any], key: str, where: str = "") -> list[Any]:
+    found = tree.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
+        raise ValueError(f"{where}{key}: wanted a list of objects, got {found!r:.40}")
+    return found
 
 
 def _natural(entry: dict[str, Any], key: str, where: str, default: int | None = None) -> int:
