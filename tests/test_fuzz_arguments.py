@@ -23,7 +23,7 @@ import diffrast as dr
 from diffrast import clip, color, files, fit, linalg, lines, mesh, shapes, views
 from diffrast.files.scenes import load_scene_file
 
-EXAMPLES = int(os.environ.get("DIFFRAST_FUZZ_EXAMPLES", "6"))
+EXAMPLES = int(os.environ.get("DIFFRAST_FUZZ_EXAMPLES", "3"))
 SECONDS = 20
 MODULES = (dr, clip, color, files, fit, linalg, lines, mesh, shapes, views)
 DATA = Path(__file__).parent / "data"

@@ -35,7 +35,7 @@ from diffrast.files import (
 from diffrast.scene_files import read_scene
 
 DATA = Path(__file__).parent / "data"
-EXAMPLES = int(os.environ.get("DIFFRAST_FUZZ_EXAMPLES", "25"))
+EXAMPLES = int(os.environ.get("DIFFRAST_FUZZ_EXAMPLES", "15"))
 SECONDS = 20  # for one file; the usual one takes a hundredth
 MEGABYTES = 64  # for one small file
 
