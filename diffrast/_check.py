@@ -94,9 +94,22 @@ def real_number(name: str, value: Any, *, above: float = -np.inf, below: float =
     return number
 
 
+def static_number(name: str, value: Any) -> float:
+    """Check a finite number that is known, also where others are traced."""
+    try:
+        if isinstance(value, str | bytes | bool | np.bool) or np.ndim(value) != 0:
+            raise TypeError("of another kind")
+        number = float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: wanted a known number, got {_brief(value)}") from error
+    if not np.isfinite(number):
+        raise ValueError(f"{name}: wanted a finite number, got {number}")
+    return number
+
+
 def distance(name: str, value: Any) -> float:
     """Check a known number of at least 0."""
-    number = float(float_array(name, value, ()))
+    number = static_number(name, value)
     if number < 0:
         raise ValueError(f"{name}: wanted a distance of at least 0, got {number}")
     return number

@@ -61,9 +61,9 @@ def fit_points(points: ArrayInput, *, size: int, margin: float = 0.95) -> Fitted
     """
     points = _check.float_array("points", points, ("points", 2))
     size = _check.positive_int("size", size)
-    margin = float(_check.real_number("margin", margin, above=0.0))
-    if margin > 1:
-        raise ValueError(f"margin: wanted a share above 0 and of at most 1, got {margin:g}")
+    margin = _check.static_number("margin", margin)
+    if not 0 < margin <= 1:
+        raise ValueError(f"margin: wanted a share above 0 and of at most 1, got {margin}")
     if not _check.is_concrete(points) or points.shape[0] == 0:
         got = "a traced array" if points.shape[0] else "no points"
         raise ValueError(f"points: wanted known numbers, from which the size follows, got {got}")
@@ -251,7 +251,9 @@ class _Style(NamedTuple):
 
 
 def _style(height: int, width: int, line_width: float, antialias: bool) -> _Style:
-    line_width = float(_check.real_number("line_width", line_width, above=0.0))
+    line_width = _check.static_number("line_width", line_width)
+    if not line_width > 0:
+        raise ValueError(f"line_width: wanted a number between 0 and inf, got {line_width}")
     return _Style(height, width, line_width, _check.flag("antialias", antialias))
 
 

@@ -134,7 +134,7 @@ def wireframe(
     if color is not None:
         color = _check.float_array("color", color, (3,))
     if normal_length is not None:
-        normal_length = float(_check.real_number("normal_length", normal_length))
+        _check.float_array("normal_length", normal_length, ())
     if edges is not None and not isinstance(edges, Sequence):
         raise ValueError(f"edges: wanted a list or None, got {type(edges).__name__}")
     if edges is not None and len(edges) != len(scene.objects):
