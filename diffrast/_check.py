@@ -4,7 +4,9 @@ Shapes and dtypes are checked always, also while tracing. Values (finite numbers
 can only be checked where they are known: a traced array passes.
 """
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
@@ -39,13 +41,11 @@ def float_array(
     Raises:
         ValueError: for anything that is not an array of real numbers of that shape.
     """
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{name}: wanted an array of numbers, got {_brief(value)} ({error})"
-        ) from error
-    if array.dtype == bool or jnp.issubdtype(array.dtype, jnp.complexfloating):
+    if isinstance(value, np.ndarray | np.generic) and np.issubdtype(value.dtype, np.integer):
+        value = value.astype(np.float64)  # JAX would drop the upper half of 64 bits
+    array = _array(name, value, "numbers")
+    is_real = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+    if not is_real:
         raise ValueError(f"{name}: wanted real numbers, got dtype {array.dtype}")
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(jnp.result_type(float))
@@ -67,17 +67,13 @@ def index_array(
     name: str, value: Any, shape: tuple[int | str, ...], *, minimum: int = 0, bound: int
 ) -> Array:
     """Convert to int32 and check that every index lies in [minimum, bound)."""
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{name}: wanted an array of integers, got {_brief(value)} ({error})"
-        ) from error
+    array = _array(name, value, "integers")
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name}: wanted integers, got dtype {array.dtype}")
     _check_shape(name, array.shape, shape)
     if is_concrete(array) and array.size:
-        numbers = np.asarray(array)
+        is_wide = isinstance(value, np.ndarray | np.generic)  # JAX cuts off 64 bits
+        numbers = np.asarray(value if is_wide else array)
         bad = np.argwhere((numbers < minimum) | (numbers >= bound))
         if len(bad):
             where = tuple(int(i) for i in bad[0])
@@ -98,18 +94,103 @@ def real_number(name: str, value: Any, *, above: float = -np.inf, below: float =
     return number
 
 
-def positive_int(name: str, value: Any, *, minimum: int = 1) -> int:
-    """Check a static count or size."""
+def static_number(name: str, value: Any) -> float:
+    """Check a finite number that is known, also where others are traced."""
+    try:
+        if isinstance(value, str | bytes | bool | np.bool) or np.ndim(value) != 0:
+            raise TypeError("of another kind")
+        number = float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: wanted a known number, got {_brief(value)}") from error
+    if not np.isfinite(number):
+        raise ValueError(f"{name}: wanted a finite number, got {number}")
+    return number
+
+
+def distance(name: str, value: Any) -> float:
+    """Check a known number of at least 0."""
+    number = static_number(name, value)
+    if number < 0:
+        raise ValueError(f"{name}: wanted a distance of at least 0, got {number}")
+    return number
+
+
+def positive_int(name: str, value: Any, *, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
+    """Check a static count or size; what counts pixels or vertices has 32 bits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValueError(f"{name}: wanted an integer of at least {minimum}, got {_brief(value)}")
+    if value > maximum:
+        raise ValueError(f"{name}: wanted an integer of at most {maximum}, got {_brief(value)}")
     return int(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Check a static yes or no."""
+    if not isinstance(value, bool | np.bool | int | np.integer) or value not in (0, 1):
+        raise ValueError(f"{name}: wanted True or False, got {_brief(value)}")
+    return bool(value)
+
+
+def instance_of(name: str, value: Any, *kinds: type) -> None:
+    """Check that an object is one of the library's."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{name}: wanted a {wanted}, got {type(value).__name__}")
+
+
+def all_instances(name: str, values: Any, kind: type) -> None:
+    """Check a sequence of objects of the library's."""
+    if not isinstance(values, Sequence):
+        raise ValueError(f"{name}: wanted a list, got {type(values).__name__}")
+    for number, value in enumerate(values):
+        instance_of(f"{name}[{number}]", value, kind)
+
+
+def iterable(name: str, value: Any, wanted: str) -> None:
+    """Check what has one entry after another."""
+    try:
+        iter(value)
+    except TypeError as error:
+        raise ValueError(f"{name}: wanted {wanted}, got {_brief(value)}") from error
+
+
+def array_tree(name: str, tree: Any) -> None:
+    """Check a tree of arrays and numbers of any kind."""
+    for leaf in jax.tree.leaves(tree):
+        foreign = isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind not in "biufcV"
+        if foreign or not isinstance(leaf, Array | np.ndarray | np.generic | int | float | complex):
+            raise ValueError(f"{name}: wanted a tree of arrays, got {_brief(leaf)} in it")
+
+
+def file_path(name: str, value: Any) -> Path:
+    """Check what should be the name of a file, there or not."""
+    try:
+        path = Path(value)
+        if b"\0" in os.fsencode(path):
+            raise ValueError("embedded null character")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}: wanted the name of a file, got {_brief(value)} ({error})"
+        ) from error
+    return path
 
 
 def one_of(name: str, value: Any, choices: tuple[str, ...]) -> str:
     """Check a choice by name."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: wanted one of {', '.join(choices)}, got {_brief(value)}")
     return value
+
+
+def _array(name: str, value: Any, wanted: str) -> Array:
+    try:
+        with np.errstate(over="ignore"):  # infinity is dealt with as such
+            return jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        reason = str(error).split("\n")[0]
+        raise ValueError(
+            f"{name}: wanted an array of {wanted}, got {_brief(value)} ({reason})"
+        ) from error
 
 
 def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...] | None) -> None:
@@ -128,5 +209,8 @@ def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...] 
 
 
 def _brief(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except Exception:  # also of lists nested too deep
+        text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."

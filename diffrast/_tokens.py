@@ -14,13 +14,12 @@ class Tokens:
 
     def __init__(self, text: str, name: str) -> None:
         visible = _COMMENT.sub(lambda comment: re.sub(r"[^\n]", " ", comment[0]), text)
+        lines = visible.split("\n")
         self._name = name
         self._words = [
-            (word, line)
-            for line, content in enumerate(visible.split("\n"), start=1)
-            for word in content.split()
+            (word, line) for line, content in enumerate(lines, start=1) for word in content.split()
         ]
-        self._last_line = len(text.splitlines())
+        self._last_line = len(lines) - (lines[-1] == "")
         self._next = 0
 
     def word(self, wanted: str) -> str:

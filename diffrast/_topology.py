@@ -13,6 +13,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast import _check
+
 
 class EdgeAdjacency(NamedTuple):
     """Every edge once, with the faces that meet there; all arrays are int32.
@@ -84,7 +86,7 @@ def representatives(positions: Any, xp: Any = np) -> Any:
     order = xp.lexsort(positions.T)  # stable: equal rows stay in the order of their index
     ordered = positions[order]
     changes = xp.any(ordered[1:] != ordered[:-1], axis=1)
-    group = xp.concatenate([xp.zeros(1, dtype=int), xp.cumsum(changes)])
+    group = xp.concatenate([xp.zeros(len(order[:1]), dtype=int), xp.cumsum(changes)])
     first = order[xp.searchsorted(group, group)]
     return first[xp.argsort(order)].astype(np.int32)
 
@@ -299,7 +301,11 @@ def join_indices(polygons: Sequence[Any] | np.ndarray, bound: int) -> tuple[np.n
     Raises:
         ValueError: for anything but lists of ids in [0, bound).
     """
-    lists = [np.asarray(polygon) for polygon in polygons]
+    _check.iterable("polygons", polygons, "lists of vertex ids")
+    try:
+        lists = [np.asarray(polygon) for polygon in polygons]
+    except ValueError as error:
+        raise ValueError(f"polygons: wanted lists of vertex ids, got others ({error})") from error
     for number, ids in enumerate(lists):
         if ids.ndim != 1 or (ids.size and not np.issubdtype(ids.dtype, np.integer)):
             raise ValueError(f"polygons: wanted a list of vertex ids, got {ids} at {number}")

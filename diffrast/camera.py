@@ -31,7 +31,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from diffrast import _compensated, opencv, viewing
-from diffrast._check import ArrayInput, float_array, positive_int, real_number
+from diffrast._check import (
+    ArrayInput,
+    all_instances,
+    float_array,
+    instance_of,
+    positive_int,
+    real_number,
+)
 from diffrast._pytree import pytree_dataclass, set_field
 from diffrast._stored import stored
 from diffrast.linalg import apply_matrix, dot, normalize, null_vector, where_finite
@@ -213,7 +220,8 @@ class Camera:
             back=back,
             projection=projection,
         )
-        axes = viewing.view_axes(-_vector("view_plane_normal", view_plane_normal), view_up)
+        normal, up = _vector("view_plane_normal", view_plane_normal), _vector("view_up", view_up)
+        axes = viewing.view_axes(-normal, up)
         point = _vector("view_reference_point", view_reference_point)
         return _placed(axes, point, matrix, -reference)
 
@@ -270,6 +278,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     Raises:
         ValueError: for no cameras, or cameras that do not all have the same fields and shapes.
     """
+    all_instances("cameras", cameras, Camera)
     if not cameras:
         raise ValueError("cameras: wanted at least one, got none")
     shapes = [jax.tree.map(jnp.shape, vars(camera)) for camera in cameras]
@@ -342,6 +351,10 @@ def viewpoint(camera: Camera) -> Float[Array, "4"]:
     A perspective camera has its eye, with w = 1; a parallel one the direction towards the viewer,
     with w = 0, oblique or not. So for every camera the unit vector from p to the viewer is
     `normalize(viewpoint[:3] - viewpoint[3] * p)`. A projection without a centre gives zeros.
+
+    Raises:
+        ValueError: for a stack of cameras, or another tree of arrays; of what is none JAX makes
+            a TypeError or OverflowError.
     """
     _check_single(camera)
     matrix, pivot = pivoted_matrix(camera)
@@ -440,6 +453,7 @@ def _placed(
 
 
 def _check_single(camera: Camera) -> None:
+    instance_of("camera", camera, Camera)
     if camera.view.ndim != 2:
         raise ValueError(
             f"camera: wanted a single camera, got a stack of shape {camera.view.shape[:-2]};"

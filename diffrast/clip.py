@@ -162,6 +162,7 @@ def clip_mesh(mesh: Mesh, camera: Camera) -> Mesh:
     Raises:
         ValueError: for traced meshes or cameras, and when nothing is left.
     """
+    _check.instance_of("mesh", mesh, Mesh)
     clip = world_to_clip(camera, mesh.vertices)
     if not (_check.is_concrete(clip) and _check.is_concrete(mesh.faces)):
         raise ValueError("mesh: wanted known vertices, faces and camera, got traced arrays")

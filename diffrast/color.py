@@ -5,7 +5,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, is_concrete, real_number
+from diffrast._check import ArrayInput, float_array, instance_of, is_concrete, real_number
 from diffrast._pytree import pytree_dataclass, set_field
 
 _SIXTH = jnp.pi / 3  # of a turn
@@ -39,12 +39,12 @@ def gamma_to_linear(encoded: ArrayLike, gamma: ArrayLike = 2.2) -> Float[Array, 
     Raises:
         ValueError: for a gamma that is not above 0.
     """
-    return _power(encoded, real_number("gamma", gamma, above=0.0))
+    return _power("encoded", encoded, real_number("gamma", gamma, above=0.0))
 
 
 def linear_to_gamma(linear: ArrayLike, gamma: ArrayLike = 2.2) -> Float[Array, "..."]:
     """Encode linear light by linear^(1 / gamma): the inverse of `gamma_to_linear`."""
-    return _power(linear, 1 / real_number("gamma", gamma, above=0.0))
+    return _power("linear", linear, 1 / real_number("gamma", gamma, above=0.0))
 
 
 def rgb_to_hls(rgb: ArrayInput) -> Float[Array, "*size 3"]:
@@ -139,7 +139,11 @@ def look_up(table: LookUpTable, values: ArrayInput) -> Float[Array, "*size chann
 
     Returns:
         (..., channels), differentiable in the values and, for a fixed order, in the table.
+
+    Raises:
+        ValueError: for values that are no numbers, and anything but a table.
     """
+    instance_of("table", table, LookUpTable)
     values = float_array("values", values, finite=False)
     positions, colors = table.positions, table.colors
     count = positions.shape[0]
@@ -151,7 +155,7 @@ def look_up(table: LookUpTable, values: ArrayInput) -> Float[Array, "*size chann
     return (1 - share) * colors[piece] + share * colors[piece + 1]
 
 
-def _power(values: ArrayLike, exponent: Array) -> Array:
-    values = float_array("values", values, finite=False)
+def _power(name: str, values: ArrayLike, exponent: Array) -> Array:
+    values = float_array(name, values, finite=False)
     positive = values > 0
     return jnp.where(positive, jnp.where(positive, values, 1) ** exponent, 0)

@@ -34,7 +34,16 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from diffrast import _least_squares, linalg
-from diffrast._check import float_array, is_concrete, one_of, positive_int, real_number
+from diffrast._check import (
+    array_tree,
+    flag,
+    float_array,
+    instance_of,
+    is_concrete,
+    one_of,
+    positive_int,
+    real_number,
+)
 from diffrast._fit_result import Callback as Callback
 from diffrast._fit_result import FitResult as FitResult
 from diffrast._fit_result import History as History
@@ -83,9 +92,11 @@ def minimize(
     """
     _check_function("loss", loss)
     params = _float_tree(params)
+    record_params, progress = _check_log(args, record_params, progress, callback)
     steps, patience = positive_int("steps", steps), positive_int("patience", patience)
     tolerance = None if tolerance is None else float(real_number("tolerance", tolerance, above=0))
     optimizer = _default_optimizer(steps) if optimizer is None else optimizer
+    instance_of("optimizer", optimizer, optax.GradientTransformation)
 
     state = optimizer.init(params)
     best, converged, reason = params, False, f"all {steps} steps taken"
@@ -208,6 +219,7 @@ def least_squares(
     """
     _check_function("residuals", residuals)
     params = _float_tree(params)
+    record_params, progress = _check_log(args, record_params, progress, callback)
     steps = positive_int("steps", steps)
     evaluate = functools.partial(
         _least_squares.evaluate,
@@ -263,6 +275,14 @@ def _check_function(name: str, function: Any) -> None:
         raise ValueError(f"{name}: wanted a hashable function, got {function!r}") from None
     if not callable(function):
         raise ValueError(f"{name}: wanted a function, got {function!r}")
+
+
+def _check_log(args: Any, record_params: bool, progress: bool, callback: Any) -> tuple[bool, bool]:
+    instance_of("args", args, tuple, list)
+    array_tree("args", args)
+    if callback is not None and not callable(callback):
+        raise ValueError(f"callback: wanted a function or None, got {type(callback).__name__}")
+    return flag("record_params", record_params), flag("progress", progress)
 
 
 def _not_finite(name: str, value: float, gradient_norm: float) -> ValueError:

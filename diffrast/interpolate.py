@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from diffrast._check import ArrayInput, float_array, index_array, positive_int
+from diffrast._check import ArrayInput, float_array, index_array, instance_of, positive_int
 from diffrast._stored import assemble, stored
 from diffrast.raster import Fragments
 from diffrast.raster.evaluate import blend, corners_at
@@ -36,6 +36,7 @@ def interpolate(
     Raises:
         ValueError: for wrong shapes and indices out of range.
     """
+    instance_of("fragments", fragments, Fragments)
     attributes = float_array("attributes", attributes, ("V", "C"), finite=False)
     faces = index_array("faces", faces, ("F", 3), bound=attributes.shape[0])
     barycentrics = [fragments.barycentrics[..., j] for j in range(3)]
@@ -86,6 +87,7 @@ def screen_derivatives(
     Raises:
         ValueError: for wrong shapes and indices out of range.
     """
+    instance_of("fragments", fragments, Fragments)
     attributes = float_array("attributes", attributes, ("V", "C"), finite=False)
     count = attributes.shape[0]
     positions_clip = float_array("positions_clip", positions_clip, (count, 4), finite=False)

@@ -34,20 +34,34 @@ from diffrast._check import ArrayInput, float_array, is_concrete
 
 
 def dot(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
-    """Inner product over the last axis; the other axes broadcast."""
-    return jnp.sum(jnp.asarray(a) * jnp.asarray(b), axis=-1)
+    """Inner product over the last axis; the other axes broadcast.
+
+    Raises:
+        ValueError: for shapes that do not go together.
+    """
+    a = float_array("a", a, ("...", "n"), finite=False)
+    b = float_array("b", b, ("...", "n"), finite=False)
+    try:
+        np.broadcast_shapes(a.shape, b.shape)
+    except ValueError as error:
+        raise ValueError(f"b: wanted a shape that goes with {a.shape}, got {b.shape}") from error
+    return jnp.sum(a * b, axis=-1)
 
 
 def norm(vectors: ArrayLike) -> Float[Array, "..."]:
     """Euclidean length over the last axis; the gradient of a zero vector is zero."""
-    unit_box, magnitude = _scale_to_unit_box(jnp.asarray(vectors))
+    unit_box, magnitude = _scale_to_unit_box(
+        float_array("vectors", vectors, ("...", "n"), finite=False)
+    )
     length = magnitude[..., 0] * jnp.sqrt(dot(unit_box, unit_box))
     return jnp.where(magnitude[..., 0] > 0, length, 0)
 
 
 def normalize(vectors: ArrayLike) -> Float[Array, "... n"]:
     """Unit vectors over the last axis; a zero vector stays zero, with zero gradient."""
-    unit_box, magnitude = _scale_to_unit_box(jnp.asarray(vectors))
+    unit_box, magnitude = _scale_to_unit_box(
+        float_array("vectors", vectors, ("...", "n"), finite=False)
+    )
     return jnp.where(magnitude > 0, unit_box / jnp.sqrt(dot(unit_box, unit_box))[..., None], 0)
 
 
@@ -65,6 +79,8 @@ def null_vector(rows: Float[Array, "3 4"]) -> Float[Array, "4"]:
 
 
 def _scale_to_unit_box(vectors: Array) -> tuple[Array, Array]:
+    if vectors.shape[-1] == 0:
+        raise ValueError(f"vectors: wanted at least one component, got shape {vectors.shape}")
     """Divide by the largest magnitude, so that squares neither over- nor underflow.
 
     Zero vectors become ones, for the caller to select away. The magnitude (last axis kept, of
@@ -183,7 +199,12 @@ def apply_matrix(
 
     Every vector goes through the same operations wherever it stands in the array, so copies of a
     vertex stay bit-equal, and no accelerator rounds the factors as it may for a matrix product.
+
+    Raises:
+        ValueError: for vectors of another length than the matrix's rows.
     """
+    matrix = float_array("matrix", matrix, ("rows", "columns"), finite=False)
+    vectors = float_array("vectors", vectors, ("...", matrix.shape[1]), finite=False)
     products = [vectors[..., k, None] * matrix[:, k] for k in range(matrix.shape[1])]
     return functools.reduce(operator.add, products)
 

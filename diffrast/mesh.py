@@ -99,6 +99,8 @@ class Mesh:
         set_field(self, "uv_faces", uv_faces)
         if topology is None:
             topology = _topology_of(positions, indices)
+        elif not isinstance(topology, Topology):
+            _check.instance_of("topology", topology, Topology)
         elif topology.patches.shape[0] != indices.shape[0]:
             raise ValueError(
                 f"topology: wanted that of {indices.shape[0]} faces, got one of"
@@ -168,8 +170,9 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
         weld: whether vertices at exactly the same position (a texture seam, a corner-split mesh)
             count as one and get one normal.
     """
+    _check.instance_of("mesh", mesh, Mesh)
     _check.one_of("weighting", weighting, WEIGHTINGS)
-    groups = jnp.asarray(_weld(mesh.vertices)) if weld else None
+    groups = jnp.asarray(_weld(mesh.vertices)) if _check.flag("weld", weld) else None
     normals = _vertex_normals(mesh.vertices, mesh.faces, groups, weighting)
     return Mesh(
         vertices=mesh.vertices,
@@ -186,6 +189,7 @@ _weld = weld  # `weld` is also the name of an option
 
 def flat_shaded(mesh: Mesh) -> Mesh:
     """Give each face its own three vertices, with the face's normal as theirs."""
+    _check.instance_of("mesh", mesh, Mesh)
     corners = mesh.faces.reshape(-1)
     normals = _face_normals(mesh.vertices, mesh.faces)
     return Mesh(
@@ -202,6 +206,7 @@ def split_uvs(mesh: Mesh) -> Mesh:
     What a file format or a program with one index array wants. Differentiate with respect to the
     vertices of the result.
     """
+    _check.instance_of("mesh", mesh, Mesh)
     if mesh.uvs is None or mesh.uv_faces is None:
         return mesh
     _, faces = _host_arrays(mesh.vertices, mesh.faces)
@@ -250,12 +255,16 @@ def from_polygons(
     _check.one_of("weighting", weighting, ("uniform", "area"))
     positions = np.asarray(positions_device, dtype=np.float64)
     corners, sizes = _topology.join_indices(polygons, len(positions))
-    group = np.zeros(len(sizes), dtype=int) if surfaces is None else np.asarray(surfaces)
+    try:
+        group = np.zeros(len(sizes), dtype=int) if surfaces is None else np.asarray(surfaces)
+    except ValueError as error:
+        raise ValueError(f"surfaces: wanted an integer for each polygon ({error})") from error
     if group.shape != sizes.shape or not np.issubdtype(group.dtype, np.integer):
         raise ValueError(
             f"surfaces: wanted an integer for each of {len(sizes)} polygons, got shape"
             f" {group.shape}, dtype {group.dtype}"
         )
+    group = group.astype(np.int64)  # next to which others would become floats
     joined = _topology.join_polygons(positions, corners, sizes)
     triangles = _topology.triangulate(positions, joined)
     # One vertex for every vertex id and surface that occur together.
@@ -347,6 +356,7 @@ def transform(mesh: Mesh, matrix: ArrayInput) -> Mesh:
     Normals follow by the inverse transpose. A mirroring matrix (negative determinant) turns the
     faces round, so that they stay counter-clockwise from outside.
     """
+    _check.instance_of("mesh", mesh, Mesh)
     matrix = _check.float_array("matrix", matrix, (4, 4))
 
     def turned(faces: Array) -> Array:
@@ -371,15 +381,19 @@ def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
     Args:
         mesh: positions must be known, not traced.
         tolerance: distance in the unit of the vertices; 0 merges equal positions only.
+
+    Raises:
+        ValueError: for a traced mesh, and a tolerance below 0 or one that leaves no face.
     """
-    distance = float(_check.float_array("tolerance", tolerance, ()))
-    if distance < 0:
-        raise ValueError(f"tolerance: wanted a distance of at least 0, got {distance}")
+    _check.instance_of("mesh", mesh, Mesh)
+    distance = _check.distance("tolerance", tolerance)
     vertices, faces = _host_arrays(mesh.vertices, mesh.faces)
     leader = _topology.clusters(vertices.astype(np.float64), distance)
     corners = leader[faces]
     proper = np.all(corners != np.roll(corners, 1, axis=1), axis=1)
     corners = corners[proper]
+    if len(corners) == 0:
+        raise ValueError(f"tolerance: wanted one that leaves a face, got {distance}")
     used, first_use, index = np.unique(corners, return_index=True, return_inverse=True)
     order = np.argsort(first_use)
     kept = used[order]
@@ -410,6 +424,7 @@ def edge_adjacency(vertices: ArrayInput, faces: ArrayInput) -> EdgeAdjacency:
 
 def euler_characteristic(mesh: Mesh) -> int:
     """Vertices − edges + faces over welded vertices: 2 for a sphere, 0 for a torus."""
+    _check.instance_of("mesh", mesh, Mesh)
     vertices, faces = _host_arrays(mesh.vertices, mesh.faces)
     half = _topology.half_edges(vertices, faces)
     welded = _topology.representatives(vertices)
@@ -419,6 +434,7 @@ def euler_characteristic(mesh: Mesh) -> int:
 
 def is_closed(mesh: Mesh) -> bool:
     """Whether the mesh bounds a solid: every edge is passed as often one way as the other."""
+    _check.instance_of("mesh", mesh, Mesh)
     half = _topology.half_edges(*_host_arrays(mesh.vertices, mesh.faces))
     _, edge = np.unique(half.key, return_inverse=True)
     return not np.any(np.bincount(edge, weights=np.where(half.low_to_high, 1, -1)))
@@ -429,6 +445,7 @@ def signed_volume(mesh: Mesh) -> Float[Array, ""]:
 
     Differentiable in the positions.
     """
+    _check.instance_of("mesh", mesh, Mesh)
     a, b, c = _corners(mesh.vertices - jnp.mean(mesh.vertices, axis=0), mesh.faces)
     return jnp.sum(dot(a, jnp.cross(b, c))) / 6
 
@@ -453,6 +470,7 @@ def _with_bodies(topology: Topology) -> Topology:
 
 
 def _check_alike(meshes: Sequence[Mesh]) -> None:
+    _check.all_instances("meshes", meshes, Mesh)
     if len(meshes) == 0:
         raise ValueError("meshes: wanted at least one mesh, got none")
     for name in ("normals", "uvs"):

@@ -13,10 +13,18 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from diffrast._check import ArrayInput, float_array, index_array
+from diffrast._check import ArrayInput, float_array, index_array, instance_of
 from diffrast._pytree import with_field
 from diffrast.color import LookUpTable, look_up
-from diffrast.light import ShiningLight, dot_columns, incoming, normalize_columns
+from diffrast.light import (
+    DirectionalLight,
+    PointLight,
+    ShiningLight,
+    SpotLight,
+    dot_columns,
+    incoming,
+    normalize_columns,
+)
 from diffrast.render import Buffers
 
 
@@ -26,6 +34,8 @@ def light_cosines(buffers: Buffers, light: ShiningLight) -> Float[Array, "height
     Differentiable in the buffers and the light's direction or position; its colours and what it
     casts of shadow play no part.
     """
+    instance_of("buffers", buffers, Buffers)
+    instance_of("light", light, DirectionalLight, PointLight, SpotLight)
     position = [buffers.position[..., i] for i in range(3)]
     normal, _ = normalize_columns([buffers.normal[..., i] for i in range(3)])
     direction, _ = incoming(with_field(light, "attenuation", None), position)
@@ -39,6 +49,7 @@ def depths(buffers: Buffers) -> Float[Array, "height width"]:
     A table from white near by to black far away makes of it a shading by distance
     (Froyen 6.2, who takes one depth for each triangle). Differentiable in the buffers.
     """
+    instance_of("buffers", buffers, Buffers)
     seen = buffers.inverse_depth > 0
     return jnp.where(seen, 1, 0) / jnp.where(seen, buffers.inverse_depth, 1)
 
@@ -64,6 +75,7 @@ def recolor(
     Raises:
         ValueError: for wrong shapes.
     """
+    instance_of("table", table, LookUpTable)
     values = float_array("values", values, ("height", "width"), finite=False)
     face = index_array("face", face, values.shape, minimum=-1, bound=2**31 - 1)
     background = float_array("background", background)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from diffrast._check import instance_of
 from diffrast._stored import assemble, stored
 from diffrast.camera import Camera
 from diffrast.deferred import shade_covered
@@ -81,8 +82,11 @@ def render(
         (height, width, 3) linear RGB, not clamped; `background` where there is no object.
 
     Raises:
-        ValueError: if the background is an image of another size, or the camera is a stack.
+        ValueError: if the background is an image of another size, the camera is a stack, or an
+            argument is another tree of arrays; of what is none JAX makes a TypeError or
+            OverflowError.
     """
+    _check_kinds(scene, camera, settings)
     side = round(settings.samples**0.5)
     height, width = settings.height * side, settings.width * side
     border = 1 if settings.antialias and scene.objects else 0
@@ -126,8 +130,9 @@ def render(
 def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Buffers:
     """What is visible at every pixel centre, before shading; `samples` is not used.
 
-    Arguments and differentiability as `render`.
+    Arguments, errors and differentiability as `render`.
     """
+    _check_kinds(scene, camera, settings)
     size = (settings.height, settings.width)
     if not scene.objects:
         three = jnp.zeros((*size, 3), camera.view.dtype)
@@ -179,7 +184,11 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
         one on its right (0) and below it (1), as 3 * face + the corner opposite to it, -1 where
         there is none; the number of pairs of pixels of one surface that a shadow parts, and the
         number of those with an edge. None without such lights or without objects.
+
+    Raises:
+        As `render`.
     """
+    _check_kinds(scene, camera, settings)
     if not scene.objects or not any(map(casts_shadow, scene.lights)):
         return None
     geometry = world_geometry(scene, settings.shading)
@@ -194,6 +203,12 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     assert cast is not None
     assert world.shadows is not None
     return parted(world.shadows, topology, pixels, cast.lit, cast.edge)
+
+
+def _check_kinds(scene: Scene, camera: Camera, settings: RenderSettings) -> None:
+    instance_of("scene", scene, Scene)
+    instance_of("camera", camera, Camera)
+    instance_of("settings", settings, RenderSettings)
 
 
 def _with_edges(

@@ -9,8 +9,9 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast import linalg, viewing
-from diffrast._check import one_of
+from diffrast._check import file_path, flag, float_array, one_of
 from diffrast.camera import Camera
+from diffrast.files._folder import inside
 from diffrast.files.bezier import load_bezier
 from diffrast.files.scenes import OPERATIONS, SceneFile, load_polygons, load_scene_file
 from diffrast.light import DirectionalLight
@@ -47,40 +48,24 @@ class FileScene(NamedTuple):
 
 
 def read_scene(path: str | Path) -> FileScene:
-    """Read a scene file and those of its objects, which lie in the same folder.
+    """Read a scene file and those of its objects, which lie in the same folder or below.
 
     Objects are polygons (*.dat) or Bézier patches (*.bez). The window lies in the plane through the
     view reference point, as the thesis's program has it, and nothing is clipped in depth but what
     is behind the centre of projection.
 
     Raises:
-        ValueError: with file and line, for files that do not follow their format.
+        ValueError: with file and line, for files that do not follow their format; with the file,
+            for objects that lie elsewhere and for numbers that are too large for a picture.
         OSError: when a file cannot be opened.
     """
-    path = Path(path)
+    path = file_path("path", path)
     file = load_scene_file(path)
-    objects, edges = [], []
-    for item in file.objects:
-        mesh, sides = _object(path.parent / item.name)
-        turns = [np.radians(degrees) for degrees in item.rotation]
-        placing = linalg.compose(
-            linalg.translation(item.translation),
-            linalg.scaling(item.scale),
-            linalg.rotation_z(turns[2]),
-            linalg.rotation_y(turns[1]),
-            linalg.rotation_x(turns[0]),
-        )
-        objects.append(Object(mesh, Material(diffuse=(0.8, 0.8, 0.8)), placing))
-        edges.append(sides)
-    light = DirectionalLight(
-        direction=[-x for x in file.light],
-        ambient=(_AMBIENT,) * 3,
-        diffuse=(1 - _AMBIENT,) * 3,
-    )
-    height = file.raster_height
-    width = max(1, int(height * file.window[0] / file.window[1]))
-    scene = Scene(objects=objects, lights=[light])
-    return FileScene(scene, _camera(file, objects), tuple(edges), height, width, file)
+    meshes = [_object(_file_of(path, item.name)) for item in file.objects]
+    try:
+        return _assembled(file, meshes)
+    except ValueError as error:  # numbers that make no picture: too large ones
+        raise ValueError(f"{path}: {error}") from error
 
 
 def render_scene_file(
@@ -100,8 +85,12 @@ def render_scene_file(
         ValueError: as `read_scene`, and for an unknown operation.
         OSError: when a file cannot be opened.
     """
+    if operation is not None:
+        one_of("operation", operation, OPERATIONS)
+    antialias = flag("antialias", antialias)
     file = read_scene(path)
-    operation = one_of("operation", operation or file.description.operation, OPERATIONS)
+    if operation is None:
+        operation = file.description.operation
     height, width = file.height, file.width
     if operation in ("phong", "gouraud"):
         settings = RenderSettings(
@@ -120,8 +109,50 @@ def render_scene_file(
     )
 
 
+def _assembled(file: SceneFile, meshes: list[tuple[Mesh, np.ndarray]]) -> FileScene:
+    """The scene of a file and the meshes of its objects."""
+    objects = []
+    for item, (mesh, _) in zip(file.objects, meshes, strict=True):
+        turns = [np.radians(degrees) for degrees in item.rotation]
+        placing = linalg.compose(
+            linalg.translation(item.translation),
+            linalg.scaling(item.scale),
+            linalg.rotation_z(turns[2]),
+            linalg.rotation_y(turns[1]),
+            linalg.rotation_x(turns[0]),
+        )
+        objects.append(Object(mesh, Material(diffuse=(0.8, 0.8, 0.8)), placing))
+    light = DirectionalLight(
+        direction=[-x for x in file.light],
+        ambient=(_AMBIENT,) * 3,
+        diffuse=(1 - _AMBIENT,) * 3,
+    )
+    height = file.raster_height
+    width = max(1, int(height * file.window[0] / file.window[1]))
+    scene = Scene(objects=objects, lights=[light])
+    edges = tuple(sides for _, sides in meshes)
+    return FileScene(scene, _camera(file, objects), edges, height, width, file)
+
+
+def _file_of(scene: Path, name: str) -> Path:
+    """The file of an object."""
+    path = inside(scene.parent, name)
+    if path is None:
+        raise ValueError(f"{scene}: wanted objects from its own folder, got {name!r}")
+    return path
+
+
 def _object(path: Path) -> tuple[Mesh, np.ndarray]:
     """Mesh of an object, and the vertices that its lines join."""
+    try:
+        return _mesh_of(path)
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _mesh_of(path: Path) -> tuple[Mesh, np.ndarray]:
     if path.suffix.lower() == ".bez":
         patches = load_bezier(path).control_points
         mesh = bezier_mesh(patches, _DIVISIONS)
@@ -144,7 +175,7 @@ def _object(path: Path) -> tuple[Mesh, np.ndarray]:
 def _camera(file: SceneFile, objects: list[Object]) -> Camera:
     """The file's view, deep enough for all objects."""
     axes = viewing.view_axes([-x for x in file.view_plane_normal], file.view_up)
-    origin = jnp.asarray(file.view_reference_point)
+    origin = float_array("view_reference_point", file.view_reference_point, (3,))
     depths = [
         (linalg.transform_points(item.transform, item.mesh.vertices) - origin) @ axes[2]
         for item in objects

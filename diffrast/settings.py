@@ -33,8 +33,8 @@ class RenderSettings:
         set_field(self, "height", _check.positive_int("height", self.height))
         set_field(self, "width", _check.positive_int("width", self.width))
         _check.one_of("shading", self.shading, SHADINGS)
-        set_field(self, "cull_backfaces", bool(self.cull_backfaces))
-        set_field(self, "antialias", bool(self.antialias))
+        set_field(self, "cull_backfaces", _check.flag("cull_backfaces", self.cull_backfaces))
+        set_field(self, "antialias", _check.flag("antialias", self.antialias))
         side = round(_check.positive_int("samples", self.samples) ** 0.5)
         if side * side != self.samples:
             raise ValueError(f"samples: wanted a square number, got {self.samples}")

@@ -28,7 +28,7 @@ from jax.sharding import Mesh as DeviceMesh
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Float
 
-from diffrast._check import is_concrete, positive_int
+from diffrast._check import all_instances, array_tree, instance_of, is_concrete, positive_int
 from diffrast.camera import Camera
 from diffrast.render import render
 from diffrast.scene import Scene
@@ -72,6 +72,9 @@ def render_views(
         ValueError: for cameras that are no stack or of unequal sizes, a chunk below 1 and an empty
             list of devices.
     """
+    instance_of("scene", scene, Scene)
+    instance_of("cameras", cameras, Camera)
+    instance_of("settings", settings, RenderSettings)
     if jnp.ndim(cameras.view) != 3:
         raise ValueError(
             f"cameras: wanted a stack, with views of shape (views, 4, 4), got shape"
@@ -110,7 +113,7 @@ def map_views(
     Raises:
         ValueError: as `render_views`.
     """
-    count, chunk, devices = _checked(views, chunk, devices)
+    count, chunk, devices = _checked(function, views, shared, chunk, devices)
     if not _known(views, shared):
         return _mapped(function, views, shared, count, devices)
     if count == 0:
@@ -141,7 +144,7 @@ def stream_views(
     Raises:
         ValueError: as `render_views`, and inside of JAX's transformations.
     """
-    count, chunk, devices = _checked(views, chunk, devices)
+    count, chunk, devices = _checked(function, views, shared, chunk, devices)
     if not _known(views, shared):
         raise ValueError("views: wanted known numbers; inside of transformations use map_views")
     if count == 0:
@@ -169,7 +172,7 @@ def sum_views(
 
     Arguments and errors as `map_views`. Sums of whole numbers and logical values are not for this.
     """
-    count, _, devices = _checked(views, None, devices)
+    count, _, devices = _checked(function, views, shared, None, devices)
     if not _known(views, shared) or count == 0:
         step = jax.checkpoint(function, prevent_cse=False)
         one = jax.eval_shape(function, shared, _one_of(views))
@@ -191,15 +194,25 @@ def sum_views(
 
 
 def _checked(
-    views: Any, chunk: int | None, devices: Sequence[jax.Device] | None
+    function: ViewFunction,
+    views: Any,
+    shared: Any,
+    chunk: int | None,
+    devices: Sequence[jax.Device] | None,
 ) -> tuple[int, int | None, tuple[jax.Device, ...]]:
+    if not callable(function):
+        raise ValueError(f"function: wanted a function, got {type(function).__name__}")
+    array_tree("views", views)
+    array_tree("shared", shared)
     shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(views)]
     if not shapes or any(not shape or shape[0] != shapes[0][0] for shape in shapes):
         raise ValueError(f"views: wanted arrays with a common leading axis, got shapes {shapes}")
     if chunk is not None:
         chunk = positive_int("chunk", chunk)
-    if devices is not None and len(devices) == 0:
-        raise ValueError("devices: wanted at least one, got none")
+    if devices is not None:
+        all_instances("devices", devices, jax.Device)
+        if len(devices) == 0:
+            raise ValueError("devices: wanted at least one, got none")
     return shapes[0][0], chunk, tuple(devices or ())
 
 

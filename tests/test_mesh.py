@@ -432,3 +432,17 @@ def test_topology_needs_known_positions():
     solid = cube()
     with pytest.raises(ValueError, match="wanted known vertices and faces, got traced"):
         jax.jit(lambda v: dm.edge_adjacency(v, solid.faces)[0])(solid.vertices)
+
+
+def test_indices_that_jax_would_cut_off_are_out_of_range():
+    wide = np.array([[2**32, 2**32 + 1, 2**32 + 2]])
+    with pytest.raises(ValueError, match=r"faces: wanted indices in \[0, 3\), got 4294967296"):
+        dm.Mesh(vertices=np.eye(3), faces=wide)
+    large = dm.Mesh(vertices=np.array([[2**40, 0, 0], [0, 1, 0], [0, 0, 1]]), faces=[[0, 1, 2]])
+    assert large.vertices[0, 0] == 2.0**40
+
+
+def test_no_vertices_and_no_faces_left():
+    assert len(dm.weld(np.zeros((0, 3)))) == 0
+    with pytest.raises(ValueError, match="tolerance: wanted one that leaves a face, got 9"):
+        dm.merge_near_vertices(cube(), 9)

@@ -85,6 +85,11 @@ def antialias(
             f" got shape {image.shape}"
         )
     _check.one_of("creases", creases, CREASES)
+    cull_backfaces = _check.flag("cull_backfaces", cull_backfaces)
+    if topology is not None:
+        _check.instance_of("topology", topology, Topology)
+    if shader is not None and not callable(shader):
+        raise ValueError(f"shader: wanted a function or None, got {type(shader).__name__}")
     background = _check.float_array("background", background).astype(image.dtype)
     if background.shape != image.shape:
         if background.shape not in ((), image.shape[2:]):
@@ -115,7 +120,7 @@ def antialias(
         scene=data,
     )
     own = None if shader is None else _by_columns(shader)
-    return antialias_image(view, shader=own, cull_backfaces=bool(cull_backfaces))
+    return antialias_image(view, shader=own, cull_backfaces=cull_backfaces)
 
 
 def _by_columns(shader: PointShader) -> Shader:

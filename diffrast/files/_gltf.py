@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from diffrast.files._gltf_structure import check_index, check_structure, entries
+
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST, LINEAR = 9728, 9729
 MAGNIFIED = (NEAREST, LINEAR)
@@ -54,18 +56,19 @@ def prepare(
         if content[16:20] != b"JSON":
             raise ValueError(f"wanted a first chunk of type JSON, got {content[16:20]!r}")
         start, end = 20, 20 + int.from_bytes(content[12:16], "little")
-    tree = json.loads(content[start:end])
+    tree = json.loads(content[start:end], parse_constant=_refuse)
     if not isinstance(tree, dict):
         raise ValueError(f"wanted a JSON object, got {tree!r:.40}")
-    uses = [_use(tree, number) for number in range(len(_entries(tree, "materials")))]
-    for number, material in enumerate(_entries(tree, "materials")):
+    check_structure(tree)
+    uses = [_use(tree, number) for number in range(len(entries(tree, "materials")))]
+    for number, material in enumerate(entries(tree, "materials")):
         material["name"] = str(number)
-    for number, mesh in enumerate(_entries(tree, "meshes")):
+    for number, mesh in enumerate(entries(tree, "meshes")):
         for primitive in mesh["primitives"]:
             where = f"meshes[{number}]"
             index = primitive.get("material")
             if index is not None:
-                _check_index(f"{where}: material", index, uses)
+                check_index(f"{where}: material", index, uses)
             use = None if index is None else uses[index]
             _mark_coordinates(tree, primitive["attributes"], use, where, need_coordinates)
     text = json.dumps(tree).encode()
@@ -106,7 +109,7 @@ def use_of(geometry: Any, uses: list[TextureUse | None]) -> TextureUse | None:
 
 def _use(tree: dict[str, Any], number: int) -> TextureUse | None:
     """What a material says of the texture that trimesh gives it."""
-    material = _entries(tree, "materials")[number]
+    material = entries(tree, "materials")[number]
     where = f"materials[{number}]"
     old = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
     info = old.get("diffuseTexture")
@@ -114,8 +117,11 @@ def _use(tree: dict[str, Any], number: int) -> TextureUse | None:
         info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     if info is None:
         return None
-    textures = _entries(tree, "textures")
-    _check_index(f"{where}: texture", info.get("index"), textures)
+    textures = entries(tree, "textures")
+    check_index(f"{where}: texture", info.get("index"), textures)
+    if "source" in textures[info["index"]]:
+        picture = textures[info["index"]]["source"]
+        check_index(f"textures[{info['index']}]: source", picture, entries(tree, "images"))
     wrap, filter_ = _sampler(tree, textures[info["index"]], f"textures[{info['index']}]")
     moved = info.get("extensions", {}).get("KHR_texture_transform", {})
     coordinates = moved.get("texCoord", info.get("texCoord", 0))
@@ -134,8 +140,8 @@ def _sampler(
     """
     sampler: dict[str, Any] = {}
     if "sampler" in texture:
-        samplers = _entries(tree, "samplers")
-        _check_index(f"{where}: sampler", texture["sampler"], samplers)
+        samplers = entries(tree, "samplers")
+        check_index(f"{where}: sampler", texture["sampler"], samplers)
         sampler, where = samplers[texture["sampler"]], f"samplers[{texture['sampler']}]"
     u, v = (_one_of(sampler, where, key, tuple(WRAPS)) or 10497 for key in ("wrapS", "wrapT"))
     larger = _one_of(sampler, where, "magFilter", MAGNIFIED)
@@ -185,22 +191,14 @@ def _mark_coordinates(
     attributes.pop(_PLAIN, None)
     attributes.pop(_NORMALIZED, None)
     if name in attributes:
-        accessors = _entries(tree, "accessors")
-        _check_index(f"{where}: {name}", attributes[name], accessors)
+        accessors = entries(tree, "accessors")
+        check_index(f"{where}: {name}", attributes[name], accessors)
         normalized = accessors[attributes[name]].get("normalized", False)
         attributes[_NORMALIZED if normalized else _PLAIN] = attributes[name]
 
 
-def _entries(tree: dict[str, Any], key: str) -> list[Any]:
-    entries = tree.get(key, [])
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError(f"{key}: wanted a list of objects, got {entries!r:.40}")
-    return entries
-
-
-def _check_index(name: str, index: Any, entries: list[Any]) -> None:
-    if type(index) is not int or not 0 <= index < len(entries):
-        raise ValueError(f"{name}: wanted an index in [0, {len(entries)}), got {index!r}")
+def _refuse(constant: str) -> None:
+    raise ValueError(f"wanted a number, got {constant}")
 
 
 def _one_of(sampler: dict[str, Any], where: str, key: str, known: tuple[int, ...]) -> int | None:

@@ -6,10 +6,21 @@ is broken. Each check here raises `ValueError` "file:line: wanted ..., got ...".
 """
 
 import math
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
+_WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
+_END_OF_LINE = re.compile(r"\r\n|\r|\n")  # not those that `str.splitlines` finds in letters
+
+
+def text_of(content: bytes, name: str) -> str:
+    """Text in any encoding that has ASCII's numbers, as comments and names may be in."""
+    if b"\0" in content:
+        line = content[: content.index(b"\0")].count(b"\n") + 1
+        raise ValueError(f"{name}:{line}: wanted text, got binary data")
+    return content.decode("latin-1")
 
 
 def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
@@ -47,7 +58,7 @@ def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
 def _obj_lines(text: str) -> Iterator[tuple[int, list[str]]]:
     """Words of every line that has any, with the number of its first line."""
     pending, first = "", 0
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(_lines(text), start=1):
         first = first if pending else number
         content = pending + line.split("#")[0]
         if content.endswith("\\"):
@@ -82,10 +93,7 @@ def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[l
         for k, (field, count) in enumerate(zip(fields, counts.values(), strict=False)):
             if not field and k > 0:
                 continue
-            try:
-                index = int(field)
-            except ValueError:
-                index = 0
+            index = _whole(field) or 0
             if index == 0 or index < -count or len(fields) > 3:
                 raise ValueError(
                     f"{where}: wanted a corner v, v/vt, v//vn or v/vt/vn with indices from 1 or"
@@ -123,11 +131,12 @@ def check_off(text: str, name: str) -> None:
     if not rest:
         raise ValueError(f"{name}:{number}: wanted the numbers of vertices and faces, got the end")
     number, words = rest[0]
-    if len(words) < 2 or not all(word.isdigit() for word in words[:2]):
+    sizes = [_count(word) for word in words[:2]]
+    if len(sizes) < 2 or min(sizes) < 0:
         raise ValueError(
             f"{name}:{number}: wanted the numbers of vertices and faces, got {_quote(words)}"
         )
-    vertices, faces = int(words[0]), int(words[1])
+    vertices, faces = sizes
     body = iter(rest[1:])
     for k in range(vertices):
         number, words = _next_line(body, f"vertex {k}", name, number)
@@ -138,18 +147,37 @@ def check_off(text: str, name: str) -> None:
         _check_indices(words, vertices, f"{name}:{number}")
 
 
-def check_ascii_ply(text: str, name: str) -> None:
-    """Check that a text PLY file has the elements that its header announces."""
-    lines = _numbered(text)
+def check_ply(content: bytes, name: str) -> None:
+    """Check the header of a PLY file and, if it is text, the elements that the header announces."""
+    header, end, _ = content.partition(b"end_header")
+    is_text = b"ascii" in b"".join(header.splitlines()[1:2])
+    lines = _numbered(text_of(content if is_text else header + end, name))
     elements: list[tuple[str, int, list[str]]] = []
     number = 1
-    for number, words in lines:  # noqa: B007 (where the header ends)
-        if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            elements.append((words[1], int(words[2]), []))
+    for number, words in lines:
+        if words[:1] == ["element"]:
+            if len(words) != 3 or _count(words[2]) < 0:
+                raise ValueError(
+                    f"{name}:{number}: wanted a name and a number after element, got"
+                    f" {_quote(words[1:])}"
+                )
+            elements.append((words[1], _count(words[2]), []))
         elif words[:1] == ["property"] and elements:
-            elements[-1][2].append("list" if words[1] == "list" else "scalar")
+            elements[-1][2].append("list" if words[1:2] == ["list"] else "scalar")
         elif words[:1] == ["end_header"]:
             break
+    else:
+        raise ValueError(f"{name}:{number}: wanted end_header, got the end of the file")
+    if is_text:
+        _check_ply_text(lines, elements, number, name)
+
+
+def _check_ply_text(
+    lines: Iterator[tuple[int, list[str]]],
+    elements: list[tuple[str, int, list[str]]],
+    number: int,
+    name: str,
+) -> None:
     vertices = sum(count for element, count, _ in elements if element == "vertex")
     for element, count, properties in elements:
         for k in range(count):
@@ -182,8 +210,13 @@ def check_ascii_stl(text: str, name: str) -> None:
 
 
 def _numbered(text: str) -> Iterator[tuple[int, list[str]]]:
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(_lines(text), start=1):
         yield number, line.split("#")[0].split()
+
+
+def _lines(text: str) -> list[str]:
+    lines = _END_OF_LINE.split(text)
+    return lines[:-1] if lines[-1] == "" else lines
 
 
 def _next_line(
@@ -198,19 +231,30 @@ def _next_line(
 
 def _check_indices(words: list[str], bound: int, where: str) -> None:
     """A number of corners and as many vertex ids, perhaps more."""
-    size = int(words[0]) if words[0].isdigit() else 0
+    size = _count(words[0])
     ids = words[1 : 1 + size]
     fits = size >= 3 and len(ids) == size
-    if not (fits and all(word.isdigit() and int(word) < bound for word in ids)):
+    if not (fits and all(0 <= _count(word) < bound for word in ids)):
         raise ValueError(
             f"{where}: wanted a number of corners and as many indices in [0, {bound}), got"
             f" {_quote(words)}"
         )
 
 
+def _whole(word: str) -> int | None:
+    """An integer as these formats write it; Python itself would also read 1_000 and ١."""
+    return int(word) if _WHOLE.fullmatch(word) else None
+
+
+def _count(word: str) -> int:
+    """A number of things, or an index from 0; −1 for any other word."""
+    whole = _whole(word)
+    return -1 if whole is None or whole < 0 else whole
+
+
 def _is_finite(word: str) -> bool:
     try:
-        return math.isfinite(float(word))
+        return math.isfinite(float(word)) and "_" not in word
     except ValueError:
         return False
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffrast._check import file_path, instance_of
 from diffrast.shapes.bezier import BezierPatches, parse_bezier
 
 
@@ -19,11 +20,17 @@ def load_bezier(path: str | Path) -> BezierPatches:
         OSError: when the file cannot be opened.
     """
     # Comments may hold letters of any encoding; the numbers are ASCII.
-    return parse_bezier(Path(path).read_text(encoding="latin-1"), str(path))
+    return parse_bezier(file_path("path", path).read_text(encoding="latin-1"), str(path))
 
 
 def save_bezier(path: str | Path, patches: BezierPatches) -> None:
-    """Write bicubic patches; reading them gives the same numbers back."""
+    """Write bicubic patches; reading them gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but patches.
+        OSError: when the file cannot be written.
+    """
+    instance_of("patches", patches, BezierPatches)
     points = np.asarray(patches.points)
     surfaces = np.asarray(patches.surfaces)
     indices = np.asarray(patches.indices).reshape(len(surfaces), 16)
@@ -32,7 +39,7 @@ def save_bezier(path: str | Path, patches: BezierPatches) -> None:
         lines.append(f"{number} {_digits(x)} {_digits(y)} {_digits(z)}")
     for number, (surface, row) in enumerate(zip(surfaces, indices, strict=True)):
         lines.append(f"{number} {surface} 16 " + " ".join(map(str, row)))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _digits(value: np.floating) -> str:

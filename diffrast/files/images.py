@@ -1,7 +1,5 @@
 """Images in and out, through Pillow: linear RGB here, sRGB in the file."""
 
-import struct
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,19 +10,8 @@ from jax import Array
 from jaxtyping import Float32, UInt8
 from PIL import Image, ImageFile, ImageOps
 
-from diffrast._check import ArrayInput, float_array, real_number
+from diffrast._check import ArrayInput, file_path, flag, float_array, iterable, real_number
 from diffrast.color import linear_to_srgb, srgb_to_linear
-
-# What Pillow raises for files that are no images, or broken ones. OSError is the common one.
-_BROKEN = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
 
 
 def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height width channels"]:
@@ -32,6 +19,8 @@ def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height
 
     Reads what Pillow reads, 8 or 16 bits a channel: PNG, JPEG, ... Grey and palette images become
     RGB. A photograph's orientation mark is obeyed. Alpha is not premultiplied and never decoded.
+    Images of more than `PIL.Image.MAX_IMAGE_PIXELS` (89 million) are refused: a small file can
+    claim to be of any size.
 
     Args:
         path: the file.
@@ -42,14 +31,16 @@ def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height
         ValueError: with the file's name, for a file that cannot be read as an image.
         FileNotFoundError: for a file that is not there.
     """
+    path, srgb = file_path("path", path), flag("srgb", srgb)
     try:
         with Image.open(path) as image:
+            check_picture(image)
             values = _deep_channels(image, path)
             if values is None:
                 values = _channels(ImageOps.exif_transpose(image))
     except FileNotFoundError:
         raise
-    except _BROKEN as error:
+    except Exception as error:  # Pillow's readers fail in any way: SyntaxError, struct.error, ...
         raise ValueError(f"{path}: cannot be read as an image ({error})") from error
     if srgb:
         color = srgb_to_linear(values[..., :3])
@@ -71,6 +62,7 @@ def save_image(path: str | Path, image: ArrayInput, *, srgb: bool = True) -> Non
             infinity, and formats that Pillow cannot write.
         FileNotFoundError: for a folder that is not there.
     """
+    path, srgb = file_path("path", path), flag("srgb", srgb)
     _write(path, [Image.fromarray(_to_bytes("image", image, srgb))])
 
 
@@ -96,8 +88,10 @@ def save_animation(
     rate = float(real_number("frames_per_second", frames_per_second, above=0.0))
     if rate > 100:
         raise ValueError(f"frames_per_second: wanted at most 100, got {rate:g}")
-    if Path(path).suffix.lower() != ".gif":
+    path, srgb = file_path("path", path), flag("srgb", srgb)
+    if path.suffix.lower() != ".gif":
         raise ValueError(f"path: wanted a name that ends in .gif, got {path}")
+    iterable("images", images, "a list of images")
     frames = [_to_bytes(f"images[{i}]", image, srgb) for i, image in enumerate(images)]
     for index, frame in enumerate(frames):
         if frame.shape != frames[0].shape:
@@ -111,6 +105,22 @@ def save_animation(
     _write(path, [Image.fromarray(f) for f in frames], save_all=True, duration=duration, loop=0)
 
 
+def check_picture(image: Image.Image) -> None:
+    """Refuse pictures that are dangerous to decode, before any of their pixels are.
+
+    Raises:
+        ValueError: for one of too many pixels, and for PostScript, a program that Ghostscript runs.
+    """
+    limit = Image.MAX_IMAGE_PIXELS
+    if limit is not None and image.width * image.height > limit:
+        raise ValueError(
+            f"wanted at most {limit} pixels, PIL.Image.MAX_IMAGE_PIXELS, got {image.width} x"
+            f" {image.height}"
+        )
+    if image.format == "EPS":
+        raise ValueError("wanted a picture of pixels, got PostScript")
+
+
 def _channels(image: Image.Image) -> Float32[np.ndarray, "height width channels"]:
     """RGB or RGBA of an image of 8 bits a channel."""
     if image.mode == "F" or image.mode.startswith("I"):
@@ -120,7 +130,7 @@ def _channels(image: Image.Image) -> Float32[np.ndarray, "height width channels"
 
 
 def _deep_channels(
-    image: ImageFile.ImageFile, path: str | Path
+    image: ImageFile.ImageFile, path: Path
 ) -> Float32[np.ndarray, "height width channels"] | None:
     """RGB or RGBA of an image of 16 bits a channel; None for any other.
 
@@ -142,7 +152,7 @@ def _deep_channels(
     return _unit(high.astype(np.uint16) * 256 + low, 65535)
 
 
-def _decode(path: str | Path, raw_mode: str) -> UInt8[np.ndarray, "height width channels"]:
+def _decode(path: Path, raw_mode: str) -> UInt8[np.ndarray, "height width channels"]:
     """Pixels of a PNG, its bytes understood as `raw_mode`."""
     with Image.open(path) as image:
         tiles: Any = [(*tile[:3], raw_mode) for tile in image.tile]
@@ -155,10 +165,10 @@ def _unit(values: np.ndarray, full: int) -> np.ndarray:
 
 
 def _to_bytes(name: str, image: ArrayInput, srgb: bool) -> UInt8[np.ndarray, "height width *c"]:
+    values = float_array(name, image)
     dtype = jnp.result_type(image) if hasattr(image, "dtype") else np.asarray(image).dtype
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(f"{name}: wanted floating-point values from 0 to 1, got dtype {dtype}")
-    values = float_array(name, image)
     channels = values.shape[2:] or (1,)
     if values.ndim not in (2, 3) or values.size == 0 or channels not in ((1,), (3,), (4,)):
         raise ValueError(
@@ -172,8 +182,8 @@ def _to_bytes(name: str, image: ArrayInput, srgb: bool) -> UInt8[np.ndarray, "he
     return pixels[..., 0] if channels == (1,) else pixels
 
 
-def _write(path: str | Path, frames: list[Image.Image], **options: Any) -> None:
-    if not Path(path).parent.is_dir():
+def _write(path: Path, frames: list[Image.Image], **options: Any) -> None:
+    if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist")
     if len(frames) > 1:
         options["append_images"] = frames[1:]

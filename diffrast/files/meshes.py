@@ -7,6 +7,7 @@ checks text formats first.
 
 import io
 import logging
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,9 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from diffrast._check import file_path, instance_of
 from diffrast.color import srgb_to_linear
 from diffrast.files import _gltf
-from diffrast.files._mesh_text import check_ascii_ply, check_ascii_stl, check_off, plain_obj
+from diffrast.files._folder import Neighbors
+from diffrast.files._mesh_text import (
+    check_ascii_stl,
+    check_off,
+    check_ply,
+    plain_obj,
+    text_of,
+)
+from diffrast.files.images import check_picture
 from diffrast.linalg import normalize
 from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
 
@@ -62,7 +72,7 @@ def load_mesh(path: str | Path) -> Mesh:
             broken file, or a file without faces.
         OSError: when the file cannot be opened.
     """
-    return _merged([part.mesh for part in _read_parts(Path(path), materials=False)])
+    return _merged([part.mesh for part in _read_parts(file_path("path", path), materials=False)])
 
 
 def load_mesh_parts(path: str | Path) -> list[MeshPart]:
@@ -70,7 +80,7 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
 
     Colours (of an OBJ file's MTL: Ka, Kd, Ks, Ns; of glTF: the base colour) are the file's
     numbers. Textures are linear RGB or RGBA, row 0 at the top; v of the uvs points up. A material
-    file or picture that cannot be found leaves `None`.
+    file or picture that is not found in the file's folder, or below, leaves `None`.
 
     A glTF texture has the wraps of its sampler, and of its filters the nearest one: "nearest" if
     its texels are to be seen from nearby, else "trilinear" if it has smaller images for afar, else
@@ -80,7 +90,7 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
     Raises:
         As `load_mesh`; ValueError also for a glTF mesh without the coordinates its texture takes.
     """
-    return _read_parts(Path(path), materials=True)
+    return _read_parts(file_path("path", path), materials=True)
 
 
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -95,7 +105,8 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
         ValueError: for an unknown suffix.
         OSError: when the file cannot be written.
     """
-    path = Path(path)
+    path = file_path("path", path)
+    instance_of("mesh", mesh, Mesh)
     suffix = _known_suffix(path)
     if suffix == ".obj":
         path.write_text(_obj_text(mesh), encoding="ascii")
@@ -122,7 +133,7 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
             scene = trimesh.load_scene(
                 io.BytesIO(content),
                 file_type=suffix[1:],
-                resolver=trimesh.resolvers.FilePathResolver(str(path)),
+                resolver=Neighbors(path),
                 process=False,
                 **options,
             )
@@ -144,19 +155,21 @@ def _checked(
     """Check text formats; what to give to trimesh, and how."""
     name = str(path)
     if suffix == ".obj":
-        text = plain_obj(_text(content, name), name, keep_materials=materials)
+        text = plain_obj(text_of(content, name), name, keep_materials=materials)
         # Keeping the order is right only where there is nothing to split vertices for.
         plain = "/" not in text.partition("\nf ")[2]
         return text.encode(), {"maintain_order": plain, "skip_materials": not materials}
     if suffix == ".off":
-        check_off(_text(content, name), name)
+        check_off(text_of(content, name), name)
     elif suffix == ".ply":
-        header = content.partition(b"end_header")[0]
-        if b"format ascii" in header:
-            check_ascii_ply(_text(content, name), name)
-        return content, {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
-    elif suffix == ".stl" and b"facet" in content[:1024] and b"\0" not in content[:1024]:
-        check_ascii_stl(_text(content, name), name)
+        check_ply(content, name)
+        header, end, body = content.partition(b"end_header")
+        # trimesh makes paths of edges, in memory that grows with the largest index, and no faces.
+        header = re.sub(rb"element\s+edge\b", b"element lines", header)
+        options = {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
+        return header + end + body, options
+    elif suffix == ".stl" and len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
+        check_ascii_stl(text_of(content, name), name)
     return content, {}
 
 
@@ -208,6 +221,8 @@ def _material(material: Any) -> dict[str, Any]:
     base = getattr(material, "baseColorFactor", None)
     if base is not None:
         base = np.asarray(base)
+        if base.shape not in ((3,), (4,)):
+            raise ValueError(f"wanted 3 or 4 numbers as a base colour, got shape {base.shape}")
         scale = 255 if base.dtype == np.uint8 else 1
         fields["diffuse"] = (base[:3] / scale).astype(np.float32)
     picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
@@ -217,6 +232,7 @@ def _material(material: Any) -> dict[str, Any]:
 
 
 def _linear_picture(picture: Any) -> np.ndarray:
+    check_picture(picture)
     has_alpha = "A" in picture.getbands() or "transparency" in picture.info
     values = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
     color = np.asarray(srgb_to_linear(values[..., :3]))
@@ -303,13 +319,6 @@ def _known_suffix(path: Path) -> str:
     if suffix not in SUFFIXES:
         raise ValueError(f"{path}: wanted a suffix among {', '.join(SUFFIXES)}, got {suffix!r}")
     return suffix
-
-
-def _text(content: bytes, name: str) -> str:
-    if b"\0" in content:
-        line = content[: content.index(b"\0")].count(b"\n") + 1
-        raise ValueError(f"{name}:{line}: wanted text, got binary data")
-    return content.decode("latin-1")  # comments and names may be in any encoding
 
 
 @contextmanager

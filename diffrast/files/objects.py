@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
+from diffrast._check import one_of
 from diffrast.files.meshes import MeshPart, load_mesh_parts
 from diffrast.material import Material
 from diffrast.mesh import with_normals
 from diffrast.scene import Object
 from diffrast.texture import Texture
+from diffrast.texture.kinds import FILTERS, wrap_pair
 
 
 def load_objects(
@@ -33,8 +35,12 @@ def load_objects(
         wrap: likewise, or else "repeat".
 
     Raises:
-        As `load_mesh`.
+        As `load_mesh`; ValueError also for an unknown filter or wrap.
     """
+    if filter is not None:
+        one_of("filter", filter, FILTERS)
+    if wrap is not None:
+        wrap_pair(wrap)
     textures: dict[tuple[object, ...], Texture] = {}
 
     def texture_of(part: MeshPart) -> Texture | None:
@@ -49,8 +55,7 @@ def load_objects(
         key = (picture.shape, picture.tobytes(), texture.filter, texture.wrap)
         return textures.setdefault(key, texture)
 
-    objects = []
-    for part in load_mesh_parts(path):
+    def object_of(part: MeshPart) -> Object:
         texture = texture_of(part)
         given = {
             name: getattr(part, name)
@@ -62,5 +67,10 @@ def load_objects(
         if not np.any(given.get("specular", 0)):
             given.pop("specular", None)
         mesh = part.mesh if part.mesh.normals is not None else with_normals(part.mesh)
-        objects.append(Object(mesh, Material(texture=texture, **given)))
-    return objects
+        return Object(mesh, Material(texture=texture, **given))
+
+    parts = load_mesh_parts(path)
+    try:
+        return [object_of(part) for part in parts]
+    except ValueError as error:  # a material of NaN
+        raise ValueError(f"{path}: {error}") from error

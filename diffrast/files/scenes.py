@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from diffrast._check import file_path, instance_of
 from diffrast._tokens import Tokens
 from diffrast.mesh import Mesh, from_polygons
 
@@ -85,27 +86,35 @@ def load_polygons(path: str | Path) -> Polygons:
         OSError: when the file cannot be opened.
     """
     # Comments may hold letters of any encoding; the numbers are ASCII.
-    tokens = Tokens(Path(path).read_text(encoding="latin-1"), str(path))
+    tokens = Tokens(file_path("path", path).read_text(encoding="latin-1"), str(path))
     count = tokens.integer("the number of points", 1)
     polygon_count = tokens.integer("the number of polygons", 1)
-    surface_count = tokens.integer("the number of surfaces", 1)
-    points = np.zeros((count, 3))
+    surface_count = tokens.integer("the number of surfaces", 1, 1 << 31)
+    # Lists grow with what is read: the numbers above may be any.
+    points: list[list[float]] = []
     for number in range(count):
         tokens.integer(f"point number {number}", number, number + 1)
-        points[number] = [tokens.number(f"{axis} of point {number}") for axis in "xyz"]
-    polygons, surfaces = [], np.zeros(polygon_count, np.int32)
+        points.append([tokens.number(f"{axis} of point {number}") for axis in "xyz"])
+    polygons: list[tuple[int, ...]] = []
+    surfaces: list[int] = []
     for number in range(polygon_count):
         tokens.integer(f"polygon number {number}", number, number + 1)
-        surfaces[number] = tokens.integer(f"the surface of polygon {number}", 0, surface_count)
+        surfaces.append(tokens.integer(f"the surface of polygon {number}", 0, surface_count))
         corners = tokens.integer(f"the number of corners of polygon {number}", 1)
         wanted = f"a point of polygon {number}"
         polygons.append(tuple(tokens.integer(wanted, 0, count) for _ in range(corners)))
     tokens.end()
-    return Polygons(points, tuple(polygons), surfaces)
+    return Polygons(np.array(points), tuple(polygons), np.array(surfaces, np.int32))
 
 
 def save_polygons(path: str | Path, polygons: Polygons) -> None:
-    """Write an object; reading it gives the same numbers back."""
+    """Write an object; reading it gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but polygons.
+        OSError: when the file cannot be written.
+    """
+    instance_of("polygons", polygons, Polygons)
     surfaces = np.asarray(polygons.surfaces)
     lines = [f"{len(polygons.points)} {len(polygons.polygons)} {surfaces.max() + 1}"]
     for number, point in enumerate(np.asarray(polygons.points)):
@@ -114,7 +123,7 @@ def save_polygons(path: str | Path, polygons: Polygons) -> None:
         )
     for number, (surface, ids) in enumerate(zip(surfaces, polygons.polygons, strict=True)):
         lines.append(f"{number} {surface} {len(ids)} " + " ".join(map(str, ids)))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 # --------------------------------------------------------------------------------------- scenes
@@ -131,7 +140,7 @@ def load_scene_file(path: str | Path) -> SceneFile:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    lines = _Lines(Path(path).read_text(encoding="latin-1"), str(path))
+    lines = _Lines(file_path("path", path).read_text(encoding="latin-1"), str(path))
     projection = PROJECTIONS[lines.choice("the type of projection", len(PROJECTIONS))]
     view_plane_distance = lines.numbers("the view plane's distance (VPD)", 1)[0]
     projection_distance = lines.numbers("the distance of the centre of projection (PRP)", 1)[0]
@@ -147,6 +156,8 @@ def load_scene_file(path: str | Path) -> SceneFile:
     raster_height = lines.choice("the number of rows", 1 << 16)
     if raster_height < 1:
         raise lines.error("a number of rows of at least 1")
+    if not raster_height * window[0] < (1 << 16) * window[1]:
+        raise lines.error(f"rows that make fewer than {1 << 16} columns of a window {window}")
     operation = OPERATIONS[lines.choice("the operation", len(OPERATIONS))]
     light = lines.three("the vector to the light")
     output = lines.word("the name of the file for the result")
@@ -176,7 +187,13 @@ def load_scene_file(path: str | Path) -> SceneFile:
 
 
 def save_scene_file(path: str | Path, scene: SceneFile) -> None:
-    """Write a scene; reading it gives the same numbers back."""
+    """Write a scene; reading it gives the same numbers back.
+
+    Raises:
+        ValueError: for anything but a scene file.
+        OSError: when the file cannot be written.
+    """
+    instance_of("scene", scene, SceneFile)
 
     def row(*numbers: float, comment: str) -> str:
         return " ".join(f"{number:.17g}" for number in numbers) + f" {{{comment}}}"
@@ -199,7 +216,7 @@ def save_scene_file(path: str | Path, scene: SceneFile) -> None:
         for name in ("scale", "rotation", "translation"):
             lines.append(row(*getattr(item, name), comment=name))
         lines.append(item.name)
-    Path(path).write_text("\n".join(lines) + "\n", encoding="latin-1")
+    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="latin-1")
 
 
 class _Lines:

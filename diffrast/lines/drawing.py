@@ -61,6 +61,7 @@ def fit_points(points: ArrayInput, *, size: int, margin: float = 0.95) -> Fitted
     """
     points = _check.float_array("points", points, ("points", 2))
     size = _check.positive_int("size", size)
+    margin = _check.static_number("margin", margin)
     if not 0 < margin <= 1:
         raise ValueError(f"margin: wanted a share above 0 and of at most 1, got {margin}")
     if not _check.is_concrete(points) or points.shape[0] == 0:
@@ -250,9 +251,10 @@ class _Style(NamedTuple):
 
 
 def _style(height: int, width: int, line_width: float, antialias: bool) -> _Style:
-    if not 0 < line_width < np.inf:
+    line_width = _check.static_number("line_width", line_width)
+    if not line_width > 0:
         raise ValueError(f"line_width: wanted a number between 0 and inf, got {line_width}")
-    return _Style(height, width, float(line_width), bool(antialias))
+    return _Style(height, width, line_width, _check.flag("antialias", antialias))
 
 
 def _drawn(
@@ -347,6 +349,7 @@ def _surface(
     if faces is None or fragments is None:
         return None
     indices = _check.index_array("faces", faces, ("faces", 3), bound=positions_clip.shape[0])
+    _check.instance_of("fragments", fragments, Fragments)
     if fragments.face.shape != (height, width):
         raise ValueError(
             f"fragments: wanted those of {height} rows and {width} columns, got"

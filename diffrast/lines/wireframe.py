@@ -37,6 +37,8 @@ def mesh_edges(mesh: Mesh, *, flat: bool = False) -> Int[np.ndarray, "edges 2"]:
         mesh: of known vertices and faces. Faces meet where positions are equal.
         flat: whether to count edges between two faces in one plane, which a polygon has none of.
     """
+    _check.instance_of("mesh", mesh, Mesh)
+    flat = _check.flag("flat", flat)
     if not (_check.is_concrete(mesh.vertices) and _check.is_concrete(mesh.faces)):
         raise ValueError(
             "mesh: wanted known vertices and faces, got traced arrays; find the edges outside jit"
@@ -125,6 +127,16 @@ def wireframe(
     Raises:
         ValueError: for wrong shapes, and traced meshes without `edges`.
     """
+    _check.instance_of("scene", scene, Scene)
+    _check.instance_of("camera", camera, Camera)
+    hidden = _check.flag("hidden", hidden)
+    cull_backfaces = _check.flag("cull_backfaces", cull_backfaces)
+    if color is not None:
+        color = _check.float_array("color", color, (3,))
+    if normal_length is not None:
+        _check.float_array("normal_length", normal_length, ())
+    if edges is not None and not isinstance(edges, Sequence):
+        raise ValueError(f"edges: wanted a list or None, got {type(edges).__name__}")
     if edges is not None and len(edges) != len(scene.objects):
         raise ValueError(
             f"edges: wanted those of {len(scene.objects)} objects, got {len(edges)} entries"

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from diffrast._check import ArrayInput, float_array, index_array, positive_int
+from diffrast._check import ArrayInput, flag, float_array, index_array, positive_int
 from diffrast._pytree import pytree_dataclass
 from diffrast._stored import assemble, stored_rows
 from diffrast.raster.coverage import visible_faces
@@ -78,7 +78,7 @@ def rasterize(
         faces,
         height=height + 2 * border,
         width=width + 2 * border,
-        cull_backfaces=bool(cull_backfaces),
+        cull_backfaces=flag("cull_backfaces", cull_backfaces),
     )
     seen = evaluate(Drawn(positions_clip, faces), all_pixels(face, positions_clip.dtype))
     return Fragments(

@@ -98,7 +98,11 @@ def bezier_mesh(
             merges nothing.
     """
     control = _check.float_array("control_points", control_points, ("patches", 4, 4, 3))
+    if control.shape[0] == 0:
+        raise ValueError("control_points: wanted at least one patch, got none")
     columns, rows = two_counts("divisions", divisions)
+    if merge_tolerance is not None:
+        _check.distance("merge_tolerance", merge_tolerance)
     # u and 1 − u both rounded once: exact mirror images, as u and v are on edges that meet.
     uvs, mirrored = grid_uvs(columns, rows), grid_uvs(columns, rows)[::-1]
     parameters = (uvs[:, 0], mirrored[:, 0], uvs[:, 1], mirrored[:, 1])
@@ -130,24 +134,27 @@ def parse_bezier(text: str, name: str = "text") -> BezierPatches:
     Raises:
         ValueError: naming `name` and the line, for anything else.
     """
+    _check.instance_of("text", text, str)
     tokens = Tokens(text, name)
     points = tokens.integer("the number of control points", 1)
     patches = tokens.integer("the number of patches", 1)
-    surfaces = tokens.integer("the number of surfaces", 1)
-    coordinates = np.zeros((points, 3))
+    surfaces = tokens.integer("the number of surfaces", 1, 1 << 31)
+    # Lists grow with what is read: the numbers above may be any.
+    coordinates: list[list[float]] = []
     for number in range(points):
         tokens.integer(f"control point number {number}", number, number + 1)
-        coordinates[number] = [tokens.number(f"{axis} of control point {number}") for axis in "xyz"]
-    indices, owners = np.zeros((patches, 16), np.int32), np.zeros(patches, np.int32)
+        coordinates.append([tokens.number(f"{axis} of control point {number}") for axis in "xyz"])
+    indices: list[list[int]] = []
+    owners: list[int] = []
     for number in range(patches):
         tokens.integer(f"patch number {number}", number, number + 1)
-        owners[number] = tokens.integer(f"the surface of patch {number}", 0, surfaces)
+        owners.append(tokens.integer(f"the surface of patch {number}", 0, surfaces))
         tokens.integer(f"the number of control points of patch {number}", 16, 17)
-        indices[number] = [
-            tokens.integer(f"a control point of patch {number}", 0, points) for _ in range(16)
-        ]
+        wanted = f"a control point of patch {number}"
+        indices.append([tokens.integer(wanted, 0, points) for _ in range(16)])
     tokens.end()
-    return BezierPatches(coordinates, indices.reshape(-1, 4, 4), owners)
+    corners = np.array(indices, np.int32).reshape(-1, 4, 4)
+    return BezierPatches(np.array(coordinates), corners, np.array(owners, np.int32))
 
 
 def _evaluate(

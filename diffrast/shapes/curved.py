@@ -26,7 +26,7 @@ def icosphere(subdivisions: int = 3, radius: ArrayLike = 1.0) -> Mesh:
     Each triangle is cut into four at the middles of its edges, which are then moved out to the
     sphere. It has no texture coordinates; `uv_sphere` has.
     """
-    count = _check.positive_int("subdivisions", subdivisions, minimum=0)
+    count = _check.positive_int("subdivisions", subdivisions, minimum=0, maximum=13)
     length = _check.real_number("radius", radius, above=0.0)
     unit, faces = icosahedron_arrays()
     for _ in range(count):
@@ -121,7 +121,7 @@ def cylinder(
     unit = _around(unit_circle(segments), np.stack([np.ones_like(level), level], axis=1))
     uvs, faces = grid_uvs(segments, divisions), grid_faces(segments, divisions)
     parts = [(unit, unit * [1, 1, 0], uvs, faces)]
-    if caps:
+    if _check.flag("caps", caps):
         parts += [_cap(segments, level=-0.5), _cap(segments, level=0.5)]
     vertices, normals, uvs, faces = _join(parts)
     scale = jnp.stack([length, length, extent])
@@ -153,7 +153,7 @@ def cone(
     uvs = np.stack([u, np.repeat([0.0, 1.0], [segments + 1, segments])], axis=1)
     faces = np.stack([side, side + 1, segments + 1 + side], axis=1)
     parts = [(np.concatenate([base, apex]), np.pad(outward, ((0, 0), (0, 1))), uvs, faces)]
-    if caps:
+    if _check.flag("caps", caps):
         parts.append(_cap(segments, level=-0.5))
     vertices, normals, uvs, faces = _join(parts)
     # On the slope, `height` outwards goes with `radius` upwards; the base points straight down.

@@ -34,7 +34,8 @@ def fractal(mesh: Mesh, iterations: int, scale: ArrayLike = 3.0) -> Mesh:
     Raises:
         ValueError: for more than 2^24 faces.
     """
-    iterations = _check.positive_int("iterations", iterations, minimum=0)
+    _check.instance_of("mesh", mesh, Mesh)
+    iterations = _check.positive_int("iterations", iterations, minimum=0, maximum=24)
     scale = _check.real_number("scale", scale, above=1.0)
     vertices = mesh.vertices
     corners = np.arange(vertices.shape[0])
@@ -81,7 +82,8 @@ def menger_sponge(level: int, *, interior: bool = False, flat: bool = True) -> M
     Raises:
         ValueError: for more than 2^24 faces.
     """
-    level = _check.positive_int("level", level, minimum=0)
+    level = _check.positive_int("level", level, minimum=0, maximum=24)
+    interior, flat = _check.flag("interior", interior), _check.flag("flat", flat)
     if 12 * 20**level > _MOST_FACES:
         raise ValueError(f"level: wanted at most {_MOST_FACES} faces, got 12·20^{level}")
     side = 3**level

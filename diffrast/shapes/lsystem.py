@@ -116,8 +116,13 @@ class LSystem:
             draw: those that draw; None: all of the alphabet.
             dimensions: 2 or 3.
         """
-        if dimensions not in _SPECIAL:
+        if _check.positive_int("dimensions", dimensions) not in _SPECIAL:
             raise ValueError(f"dimensions: wanted 2 or 3, got {dimensions}")
+        for name, text in (("initiator", initiator), ("alphabet", alphabet), ("draw", draw)):
+            if not (isinstance(text, str) or (text is None and name != "initiator")):
+                raise ValueError(f"{name}: wanted a string, got {type(text).__name__}")
+        if not isinstance(rules, Mapping) or not all(isinstance(key, str) for key in rules):
+            raise ValueError(f"rules: wanted a dictionary of strings, got {rules!r:.40}")
         special = _SPECIAL[dimensions]
         choices = tuple((symbol, _choices(symbol, rule)) for symbol, rule in sorted(rules.items()))
         strings = [initiator, *(s for _, options in choices for _, s in options)]
@@ -210,7 +215,7 @@ class LSystem:
         )
 
     def _codes(self, iterations: int, key: Array | None) -> np.ndarray:
-        iterations = _check.positive_int("iterations", iterations, minimum=0)
+        iterations = _check.positive_int("iterations", iterations, minimum=0, maximum=1 << 16)
         chance = any(len(options) > 1 for _, options in self.rules)
         if not chance:
             key = None
@@ -231,7 +236,14 @@ def _choices(symbol: str, rule: Rule) -> tuple[tuple[float, str], ...]:
         raise ValueError(f"rules: wanted single symbols as keys, got {symbol!r}")
     if isinstance(rule, str):
         return ((1.0, rule),)
-    options = tuple((float(chance), text) for chance, text in rule)
+    try:
+        options = tuple((float(chance), text) for chance, text in rule)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"rules[{symbol!r}]: wanted a string or pairs of a probability and one, got"
+            f" {rule!r:.40}"
+        ) from error
+    _check.all_instances(f"rules[{symbol!r}]", [text for _, text in options], str)
     total = sum(chance for chance, _ in options)
     if not options or min(chance for chance, _ in options) < 0 or abs(total - 1) > 1e-6:
         raise ValueError(

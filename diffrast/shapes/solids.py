@@ -12,6 +12,7 @@ form to count, copy, subdivide, or fit by moving vertices. Faces are counter-clo
 
 import numpy as np
 
+from diffrast import _check
 from diffrast.mesh import Mesh, flat_shaded
 
 
@@ -85,7 +86,7 @@ def buckyball(*, flat: bool = True) -> Mesh:
         places, np.arange(count)[:, None] * count + np.stack(around, axis=1)
     )
     mesh = Mesh(vertices=points, faces=np.concatenate([_fans(pentagons), _fans(hexagons)]))
-    return flat_shaded(mesh) if flat else mesh
+    return flat_shaded(mesh) if _check.flag("flat", flat) else mesh
 
 
 def icosahedron_arrays() -> tuple[np.ndarray, np.ndarray]:
@@ -109,7 +110,7 @@ def icosahedron_arrays() -> tuple[np.ndarray, np.ndarray]:
 def _solid(corners: np.ndarray, polygons: np.ndarray, flat: bool) -> Mesh:
     """Cut equal convex polygons into fans."""
     mesh = Mesh(vertices=corners, faces=_fans(polygons))
-    return flat_shaded(mesh) if flat else mesh
+    return flat_shaded(mesh) if _check.flag("flat", flat) else mesh
 
 
 def _fans(polygons: np.ndarray) -> np.ndarray:

@@ -33,7 +33,8 @@ def teapot(divisions: int | tuple[int, ...] = 10, *, surfaces: Sequence[str] | N
     """
     patches = teapot_patches()
     wanted = SURFACES if surfaces is None else surfaces
-    if not wanted:
-        raise ValueError("surfaces: wanted at least one name, got none")
+    _check.iterable("surfaces", wanted, "a list of names")
     numbers = [SURFACES.index(_check.one_of("surfaces", name, SURFACES)) for name in wanted]
+    if not numbers:
+        raise ValueError("surfaces: wanted at least one name, got none")
     return bezier_mesh(patches.control_points[np.isin(patches.surfaces, numbers)], divisions)

@@ -63,14 +63,11 @@ class Texture:
         if mapping is not None and not isinstance(mapping, PlanarMapping | SphereMapping):
             kind = type(mapping).__name__
             raise ValueError(f"mapping: wanted PlanarMapping, SphereMapping or None, got {kind}")
-        pair = (wrap, wrap) if isinstance(wrap, str) else wrap
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(f"wrap: wanted one name or two, got {wrap!r}")
         if positive_int("anisotropy", anisotropy) > 16:
             raise ValueError(f"anisotropy: wanted at most 16, got {anisotropy}")
         set_field(self, "image", image)
         set_field(self, "mapping", mapping)
-        set_field(self, "wrap", tuple(one_of("wrap", name, WRAPS) for name in pair))
+        set_field(self, "wrap", wrap_pair(wrap))
         set_field(self, "filter", one_of("filter", filter, FILTERS))
         set_field(self, "anisotropy", int(anisotropy))
 
@@ -131,6 +128,14 @@ class CubeTexture:
         places = ((1, 2), (1, 0), (0, 1), (2, 1), (1, 3), (1, 1))
         images = jnp.stack([tiles[row, :, column] for row, column in places])
         return CubeTexture(images, mapping=mapping, filter=filter)
+
+
+def wrap_pair(wrap: str | tuple[str, str]) -> tuple[str, str]:
+    """Check what lies beyond an image along u and v, given for both at once or for each."""
+    pair = (wrap, wrap) if isinstance(wrap, str) else wrap
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ValueError(f"wrap: wanted one name or two, got {wrap!r:.40}")
+    return one_of("wrap", pair[0], WRAPS), one_of("wrap", pair[1], WRAPS)
 
 
 AnyTexture: TypeAlias = Texture | CubeTexture

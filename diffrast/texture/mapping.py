@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, one_of, real_number
+from diffrast._check import ArrayInput, float_array, instance_of, one_of, real_number
 from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.light import Columns, normalize_columns
 from diffrast.linalg import dot
@@ -135,6 +135,7 @@ def map_points(
     Raises:
         ValueError: for wrong shapes, and missing normals.
     """
+    instance_of("mapping", mapping, PlanarMapping, SphereMapping, CubeMapping)
     points = float_array("points", points, ("...", 3), finite=False)
     if normals is not None:
         normals = float_array("normals", normals, points.shape, finite=False)
