@@ -30,10 +30,11 @@ from typing import Any
 
 import numpy as np
 import peers
+import renderer
 from benchmark_raster import scenes as benchmark_scenes
 from common import pyplot, save_json
 from exactness import qualities
-from peers import Peer, Task, in_floats
+from renderer import Peer, Task, in_floats
 from timing import benchmark_options, markdown, minimum_times, three_digits
 
 import diffrast as dr
@@ -63,7 +64,7 @@ EARLIER = {
         "diffren splat": ((19, 65), (89, 244), (286, 1008)),
     },
 }
-OWN: tuple[type[Peer], ...] = (peers.Diffrast, peers.DiffrastInterior)
+OWN: tuple[type[Peer], ...] = (renderer.Diffrast, renderer.DiffrastInterior)
 
 
 def tasks(size: int) -> dict[str, Task]:
@@ -121,11 +122,11 @@ def checked(task: Task, which: Sequence[type[Peer]], missing: dict[str, str]) ->
     for kind in which:
         try:
             found.append(kind(task))
-        except peers.MissingPeerError as error:
+        except renderer.MissingPeerError as error:
             missing[kind.name] = str(error)
     expected = {
-        "phong": functools.cache(peers.DiffrastInterior(task).image),
-        "gouraud": functools.cache(peers.DiffrastGouraud(task).image),
+        "phong": functools.cache(renderer.DiffrastInterior(task).image),
+        "gouraud": functools.cache(renderer.DiffrastGouraud(task).image),
     }
     for peer in found:
         check_picture(peer, in_floats(peer.image()), expected[peer.shading]())
@@ -223,8 +224,8 @@ def speeds(times: dict[str, Any]) -> dict[str, Any]:
             ratios = {}
             for kind in ("forward_ms", "both_ms"):
                 others = [t[kind] for peer, t in cell.items() if peer not in own and t[kind]]
-                if others and peers.Diffrast.name in cell:
-                    ratios[kind] = min(others) / cell[peers.Diffrast.name][kind]
+                if others and renderer.Diffrast.name in cell:
+                    ratios[kind] = min(others) / cell[renderer.Diffrast.name][kind]
             cells[f"{name}, {size}"] = ratios
     means = {}
     for kind in ("forward_ms", "both_ms"):

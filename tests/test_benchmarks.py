@@ -1,16 +1,20 @@
 """The benchmarks, at tiny size: what they check, measure and write."""
 
+import dataclasses
 import json
 import sys
 
+import benchmark_error
 import benchmark_features
 import benchmark_peers
 import benchmark_scaling
 import benchmark_stages
+import error_scenes
 import exactness
 import numpy as np
 import peers
 import pytest
+import renderer
 import timing
 
 SPHERE = "sphere, 5,120 faces"
@@ -34,25 +38,25 @@ def task():
 
 @pytest.fixture(scope="module")
 def own(task):
-    return peers.DiffrastInterior(task)
+    return renderer.DiffrastInterior(task)
 
 
-class Absent(peers.Peer):
+class Absent(renderer.Peer):
     name = "absent"
 
     def __init__(self, task):
-        raise peers.MissingPeerError("absent needs what is not there")
+        raise renderer.MissingPeerError("absent needs what is not there")
 
 
 def test_peers_are_timed_and_compared(tmp_path, monkeypatch, own):
-    class Own(peers.Peer):  # compiled already
+    class Own(renderer.Peer):  # compiled already
         name = "diffrast"
         image, gradient = staticmethod(own.image), staticmethod(own.gradient)
 
     class Twin(Own):
         name = "twin"
 
-    monkeypatch.setattr(peers, "DiffrastInterior", lambda task: own)
+    monkeypatch.setattr(renderer, "DiffrastInterior", lambda task: own)
     report = benchmark_peers.run(
         tmp_path,
         sizes=(32,),
@@ -86,7 +90,7 @@ def test_peers_are_timed_and_compared(tmp_path, monkeypatch, own):
 )
 def test_a_peer_that_is_not_installed_says_what_to_install(kind, module, task, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(peers.MissingPeerError, match=r"install diffrast\[peers\]"):
+    with pytest.raises(renderer.MissingPeerError, match=r"install diffrast\[peers\]"):
         kind(task)
 
 
@@ -95,13 +99,24 @@ def test_a_peer_that_is_not_installed_says_what_to_install(kind, module, task, m
 def test_an_installed_peer_draws_the_same_picture(kind, task, own):
     try:
         peer = kind(task)
-    except peers.MissingPeerError as missing:
+    except renderer.MissingPeerError as missing:
         pytest.skip(str(missing))
-    expected = own.image() if kind.shading == "phong" else peers.DiffrastGouraud(task).image()
-    benchmark_peers.check_picture(peer, peers.in_floats(peer.image()), expected)
+    expected = own.image() if kind.shading == "phong" else renderer.DiffrastGouraud(task).image()
+    benchmark_peers.check_picture(peer, renderer.in_floats(peer.image()), expected)
     if kind is peers.Mitsuba:  # the same derivative as ours without edges
         target = np.roll(expected, 2, axis=1)
         np.testing.assert_allclose(peer.gradient(target), own.gradient(target), rtol=0.02, atol=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_samples_of_a_peer_are_those_of_a_larger_picture(task):
+    try:
+        several = renderer.with_samples(peers.Mitsuba, 2)(task)
+    except renderer.MissingPeerError as missing:
+        pytest.skip(str(missing))
+    large = peers.Mitsuba(dataclasses.replace(task, size=2 * task.size)).image()
+    blocks = large.reshape(task.size, 2, task.size, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(several.image(), blocks, atol=1e-5)
 
 
 def test_another_picture_is_not_timed(own):
@@ -125,6 +140,74 @@ def test_pose_steps_move_the_mesh_by_a_pixel(task):
         moved = eye + 1e-4 * step * (np.cross(axis, eye) if i < 3 else axis)
         distance = np.linalg.norm(pixels(moved) - pixels(eye), axis=1)
         np.testing.assert_allclose(np.sqrt((distance**2).mean()), 1e-4, rtol=1e-3)
+
+
+# Errors -------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_many_samples_tell_the_truth_and_how_far_it_may_be_off():
+    """A slanted edge: what it uncovers as it moves is its length, weighted."""
+    size, samples = 16, 64
+    grid = (np.arange(8 * size) + 0.5) / 8
+
+    def draw(motion, shift):
+        fine = (grid + shift[0])[None, :] + 0.1 * (grid + shift[1])[:, None] > 7.3 + motion[0]
+        pixels = fine.reshape(size, 8, size, 8).mean(axis=(1, 3))
+        return np.repeat(pixels[..., None], 3, axis=2)
+
+    truth = exactness.exact(draw, size, np.ones(1), samples=samples, pictures=8)
+    middle = truth.images.mean(axis=0)[5, :, 0]  # the edge at x = 7.3 - 0.1 * 5.5, on average
+    np.testing.assert_allclose(middle, np.clip(np.arange(16) + 1 - 6.75, 0, 1), atol=0.02)
+    steps = np.linspace(-exactness.STEP, exactness.STEP, 101)
+    column = np.floor(7.3 - 0.1 * grid[:, None] + steps).astype(int)
+    row = np.arange(8 * size)[:, None] // 8
+    along_edge = -truth.field.sum(axis=2)[row, column].mean() * size
+    assert truth.slopes.mean() == pytest.approx(along_edge, rel=0.03)
+    own = truth.own_errors()
+    assert 0 < own["rmse"] < 0.01
+    assert own["gradient_error"] < 0.1
+    assert truth.errors(truth.images.mean(axis=0), truth.slopes.mean(axis=0)) == {
+        "rmse": 0,
+        "mean_difference": 0,
+        "gradient_error": 0,
+        "gradient_cosine": pytest.approx(1),
+    }
+
+
+def test_a_front_is_what_none_of_ours_beats():
+    def point(time, error, peer=False):
+        return {"forward_ms": time, "rmse": error, "peer": peer}
+
+    points = [point(1, 0.9), point(2, 0.5), point(3, 0.6), point(4, 0.5), point(1, 0.6, True)]
+    points.append(point(0.5, 1.0))  # as wrong as nothing at all
+    benchmark_error.mark_fronts(points)
+    assert [p["picture_front"] for p in points] == [True, True, False, False, True, False]
+    assert not any("derivative_front" in p for p in points)
+
+
+def test_errors_fall_with_samples(tmp_path, monkeypatch):
+    every = error_scenes.filter_settings
+
+    def few(*arguments, **options):
+        return [found for found in every(*arguments, **options) if found.series == "nearest"]
+
+    monkeypatch.setattr(error_scenes, "filter_settings", few)
+    report = benchmark_error.run(
+        tmp_path,
+        size=24,
+        repeats=1,
+        families=("filters",),
+        sides=(1, 4),
+        truths=error_scenes.Truths(16, 2),
+    )
+    points = report["panels"]["filters"]["points"]
+    assert [point["setting"] for point in points] == ["1", "16"]
+    one, many = (point["rmse"] for point in points)
+    assert many < 0.5 * one
+    assert points[1]["picture_front"]
+    assert {p["gradient_error"] for p in points} == {1.0}  # "nearest" has no derivative
+    assert read(tmp_path, "benchmark_error")["missing"] == {}
+    assert benchmark_error.table(report, front=True).count("| filters | nearest |") >= 1
 
 
 # The others ---------------------------------------------------------------------------------------
