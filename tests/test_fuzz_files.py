@@ -64,7 +64,8 @@ sys.addaudithook(watch)  # there is no way to remove it
 
 def check_opened(folder):
     """Only files of the folder were read, but for modules that were imported, and none written."""
-    places = [Path(place).resolve() for place in (sys.prefix, sys.base_prefix, *sys.path) if place]
+    own = Path(dr.__file__).parent  # tracebacks that are logged quote it
+    places = [Path(p).resolve() for p in (sys.prefix, sys.base_prefix, own, *sys.path) if p]
     for name, flags in opened:
         path = Path(name).resolve()
         if path.is_relative_to(folder):
