@@ -26,9 +26,9 @@ Written to `--out`: `benchmark_error.json`, `.md` (the fronts, then everything) 
 Expected: "edges" with one sample is more exact than 16 samples without, and faster; more samples
 with edges lower the error further, near to that of the truth. Derivatives of moving outlines need
 edges, whatever the samples. Float64 costs more and changes no error. Trilinear filters beat 16
-samples, with anisotropy the more. A finer shadow map helps the picture where there are edges, and
+samples, if with anisotropy. A finer shadow map helps the picture where there are edges, and
 hardly where there are none. Finer meshes lower the error until that of the pixels is left. How
-long: half an hour on two cores, most of it compilation; `--families` and `--scenes` choose.
+long: twenty minutes on two cores, most of it compilation; `--families` and `--scenes` choose.
 """
 
 import json
