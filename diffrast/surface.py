@@ -12,7 +12,14 @@ from jax import Array
 from diffrast._topology import Topology
 from diffrast.camera import Camera, direction_to_clip, viewpoint, world_to_clip
 from diffrast.edges import Cast
-from diffrast.geometry import Geometry, Points, at_points, normals_at, positions_at
+from diffrast.geometry import (
+    Geometry,
+    Points,
+    at_points,
+    normals_at,
+    positions_at,
+    scene_topology,
+)
 from diffrast.light import (
     AmbientLight,
     Columns,
@@ -47,7 +54,8 @@ def cast_shadows(
     """The world with the shadows that fall on points, and which lights reach those."""
     if shading == "unlit" or not any(map(casts_shadow, scene.lights)):
         return World(scene, camera, geometry, None), (None,) * len(scene.lights)
-    shadows, reached = cast(scene.lights, geometry, points)
+    neighbors = jnp.asarray(scene_topology(scene).neighbors)
+    shadows, reached = cast(scene.lights, geometry, neighbors, points)
     return World(scene, camera, geometry, shadows), reached
 
 

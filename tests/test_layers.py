@@ -77,6 +77,7 @@ ORDER = [
     "diffrast.shade",
     "diffrast.shadows.views",
     "diffrast.shadows.maps",
+    "diffrast.shadows.near",
     "diffrast.shadows.lit",
     "diffrast.shadows.cast",
     "diffrast.shadows.outlines",

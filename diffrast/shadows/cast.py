@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast._topology import Edges
@@ -14,8 +14,9 @@ from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, ShiningLight, casts_shadow
 from diffrast.linalg import dot
 from diffrast.mesh import face_normals
-from diffrast.shadows.lit import Rays, lit
+from diffrast.shadows.lit import lit
 from diffrast.shadows.maps import Pictures, Plan, plan, take
+from diffrast.shadows.near import Rays
 from diffrast.shadows.views import LightView, Seen, light_view, see, sides, source
 
 Reached: TypeAlias = tuple[Array | None, ...]  # by each light: 1 at points it reaches, or 0
@@ -35,14 +36,18 @@ class Shadows(NamedTuple):
     turned: tuple[Bool[Array, " faces"], ...]  # whether faces turn their outside to the light
     windows: tuple[Float[Array, "sides 4"], ...]
     pictures: tuple[Pictures, ...]  # one for each resolution, in ascending order
+    neighbors: Int[Array, "F 3"]  # of the faces that cast them
 
 
-def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple[Shadows, Reached]:
+def cast(
+    lights: tuple[Light, ...], geometry: Geometry, neighbors: Int[Array, "F 3"], points: Points
+) -> tuple[Shadows, Reached]:
     """Take the pictures of the lights that cast shadows, fitted to points.
 
     Args:
         lights: of the scene.
         geometry: of the scene.
+        neighbors: of its faces, see `Topology`.
         points: that shadows may fall on.
 
     Returns:
@@ -66,7 +71,7 @@ def cast(lights: tuple[Light, ...], geometry: Geometry, points: Points) -> tuple
             joined = zip(*(plans[i] for i in members), strict=True)
             together = Plan(*(jnp.concatenate(column) for column in joined))
             pictures.append(take(together, geometry, size))
-        shadows = Shadows(tuple(views), tuple(turned), windows, tuple(pictures))
+        shadows = Shadows(tuple(views), tuple(turned), windows, tuple(pictures), neighbors)
         return shadows, _reached(lights, shadows, geometry, points, regards)
 
 
@@ -153,7 +158,7 @@ def _reached(
             first += sides(casting[i])
         together = zip(*parts, strict=True)
         rays = Rays(*(jnp.concatenate(column, axis=-1) for column in together))
-        bright = lit(pictures, geometry, rays).reshape(len(members), *shape)
+        bright = lit(pictures, geometry, shadows.neighbors, rays).reshape(len(members), *shape)
         reached.update(zip(members, bright, strict=True))
     numbers = iter(range(len(casting)))
     return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)

@@ -2,160 +2,181 @@
 
 Most points are told by one texel of the light's picture (see `maps`). The others, at the outlines
 of shadows and where the picture is too coarse for the surface, are collected and looked at one by
-one: the faces at the 3×3 texels round such a point are cut with its ray to the light, everything
-relative to a corner of the point's own face, so that no bias is needed but for rounding. Outlines
-of faces larger than a texel are exact at any resolution; those of smaller ones, which none of the
-nine texels may show, are good to half a texel.
+one: the faces at the 3×3 texels round such a point, and those to which walks over the surface lead
+from them towards the point, are cut with its ray to the light. So outlines are exact at any
+resolution, also where faces at the rim are thinner than a texel, but for surfaces of which none of
+the nine texels shows anything.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._selection import over_batches, selected
+from diffrast._selection import over_batches, prefix_sum, selected
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
 from diffrast.shadows.maps import Pictures
+from diffrast.shadows.near import (
+    ROUNDINGS,
+    Line,
+    Nearby,
+    Rays,
+    Texel,
+    cut_by,
+    face_corners,
+    faces_near,
+    texel_of,
+)
 
-_AT_ONCE = 512
-_ROUNDINGS = 32
+_AT_ONCE = 1024
+_WAYS_AT_ONCE = 256
+_STEPS = 64  # from face to face
 _SMALL = 4.0  # square texels, twice the area of a face
 
 
-class Rays(NamedTuple):
-    """Points on faces and the pictures that may show them; all of one shape (n,)."""
+class _Ways(NamedTuple):
+    """Ways over the surface."""
 
     face: Int[Array, " n"]
-    barycentrics: Float[Array, "3 n"]
-    picture: Int[Array, " n"]
-    x: Float[Array, " n"]  # in texels
-    y: Float[Array, " n"]
-    key: Float[Array, " n"]
-    unit: Float[Array, " n"]  # of the key, for rounding errors
-    asked: Bool[Array, " n"]  # false where the light does not shine
+    turn: Float[Array, " n"]  # of the face before
+    goes: Bool[Array, " n"]
+    stops: Bool[Array, " n"]  # whether a face at the end stops the ray
+    lost: Bool[Array, " n"]  # at the border of the surface
 
 
-class Nearby(NamedTuple):
-    """The faces at the 3×3 texels round rays; corners are x, y and z by rows."""
-
-    face: Int[Array, "9 n"]
-    key: Float[Array, "9 n"]
-    corners: Float[Array, "3 3 9 n"]
-    own: Float[Array, "3 3 n"]  # of the face on which the ray begins
-    stops: Float[Array, "9 n"]  # positive for faces that stop the ray
-
-
-class _Texel(NamedTuple):
-    """Texels, and where points lie from their centres."""
-
-    row: Int[Array, " n"]
-    column: Int[Array, " n"]
-    x: Float[Array, " n"]
-    y: Float[Array, " n"]
-
-
-def lit(pictures: Pictures, geometry: Geometry, rays: Rays) -> Float[Array, " n"]:
+def lit(
+    pictures: Pictures, geometry: Geometry, neighbors: Int[Array, "F 3"], rays: Rays
+) -> Float[Array, " n"]:
     """1 where a light sees points that are asked for, 0 elsewhere. Not differentiable."""
-    texel = _texel_of(pictures, rays)
+    texel = texel_of(pictures, rays)
     key, slope_x, slope_y, error = _at_texels(pictures.texel, rays.picture, texel).T
     depth = key + slope_x * texel.x + slope_y * texel.y
-    rounding = _ROUNDINGS * jnp.finfo(key.dtype).eps * rays.unit
+    rounding = ROUNDINGS * jnp.finfo(key.dtype).eps * rays.unit
     bright = rays.asked & (rays.key >= depth - error - rounding)
     order, count = selected(rays.asked & jnp.isinf(error))
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
         some = stored(Rays(*(column[..., chosen] for column in rays)))
         place = jnp.where(exists, chosen, bright.size)
-        return bright.at[place].set(~_blocked(pictures, geometry, some), mode="drop")
+        return bright.at[place].set(~_blocked(pictures, geometry, neighbors, some), mode="drop")
 
     return over_batches(order, count, _AT_ONCE, look_closer, bright).astype(key.dtype)
 
 
-def _texel_of(pictures: Pictures, rays: Rays) -> _Texel:
-    last = pictures.face.shape[1] - 1
-    column, row = (jnp.clip(jnp.floor(at), 0, last).astype(jnp.int32) for at in (rays.x, rays.y))
-    return _Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
-
-
-def _at_texels(values: Array, picture: Array, texel: _Texel) -> Array:
+def _at_texels(values: Array, picture: Array, texel: Texel) -> Array:
     """Entries of an array (pictures, size, size, ...)."""
     size = values.shape[1]
     number = (picture * size + texel.row) * size + texel.column
     return values.reshape(-1, *values.shape[3:])[stored(number)]
 
 
-def _blocked(pictures: Pictures, geometry: Geometry, rays: Rays) -> Bool[Array, " n"]:
+def _blocked(
+    pictures: Pictures, geometry: Geometry, neighbors: Int[Array, "F 3"], rays: Rays
+) -> Bool[Array, " n"]:
     """Whether faces near the rays from points to the light stop them."""
     nearby = faces_near(pictures, geometry, rays)
-    return (jnp.max(nearby.stops, axis=0) > 0) | _hidden_by_small(pictures, rays, nearby)
+    texel, nine = texel_of(pictures, rays), jnp.arange(9)[:, None]
+    slopes, _ = _slopes(pictures, rays, nearby.own)
+    along_row = slopes[0] * (texel.x - (nine % 3 - 1))
+    along_column = slopes[1] * (texel.y - (nine // 3 - 1))
+    before = stored((nearby.key - rays.key) + along_row + along_column)
+    hidden, unknown = _walk(geometry, neighbors, rays.face, nearby, before > 0)
+    return hidden | (unknown & _hidden_by_small(pictures, rays, nearby, slopes, before[4]))
 
 
-def face_corners(geometry: Geometry, face: Int[Array, "*n"]) -> Float[Array, "3 3 *n"]:
-    """x, y and z by rows of the three corners of faces."""
-    return stored(geometry.positions.T[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
+def _walk(
+    geometry: Geometry,
+    neighbors: Int[Array, "F 3"],
+    own: Int[Array, " n"],
+    nearby: Nearby,
+    before: Bool[Array, "9 n"],
+) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
+    """Whether the faces near rays, or those to which ways over the surface lead, stop them.
 
-
-def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
-    """The faces at the 3×3 texels round rays, and which of them stop these."""
-    texel = _texel_of(pictures, rays)
-    last = pictures.face.shape[1] - 1
+    Ways go from what the texels show before the plane of the ray's own face, each time across the
+    edge beyond which the ray lies farthest; they end where the surface does, or turns away. Also
+    returns whether the way from the nearest texel came to the surface's border, or to no end: then
+    one cannot know what is beyond.
+    """
+    n = own.size
+    hidden = jnp.any(nearby.cut.stops > 0, axis=0)
+    ahead = jnp.where(nearby.face >= 0, _across(neighbors, nearby.face, nearby.cut.corner), -1)
+    unknown = (nearby.face[4] >= 0) & (nearby.cut.corner[4] < 3) & (ahead[4] < 0)
+    goes = before & (ahead >= 0) & (ahead != own) & ~hidden & (nearby.cut.turn != 0)
     nine = jnp.arange(9)[:, None]
-    row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
-    column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
-    around = stored(pictures.face[rays.picture, row, column])
-    own, others = face_corners(geometry, rays.face), face_corners(geometry, around)
-    origin = own[:, 0]
-    total = jnp.sum(rays.barycentrics, axis=0)
-    shares = rays.barycentrics / jnp.where(total == 0, 1, total)
-    point = shares[1] * (own[:, 1] - origin) + shares[2] * (own[:, 2] - origin)
-    source = pictures.plan.source[rays.picture].T
-    ray = (source[:3] - source[3] * origin) - source[3] * point
-    ray, corners = stored((ray, (others - origin[:, None, None]) - point[:, None, None]))
-    stops = _stops(corners, ray[:, None], endless=source[3] == 0)
-    foreign = (around >= 0) & (around != rays.face)
-    key = pictures.texel[rays.picture, row, column, 0]
-    return Nearby(around, key, others, own, jnp.where(foreign, stops, -1))
+    rank = jnp.where(nine == 4, -1, nine)
+    told = before | (nearby.cut.corner == 3)
+    for i in range(9):
+        again = (ahead == nearby.face[i]) & told[i]
+        again = again | ((ahead == ahead[i]) & before[i] & (rank > rank[i]))
+        goes = goes & ~(again & (nine != 4))
+    number = stored(prefix_sum(jnp.ravel(goes).astype(jnp.int32)))
+    ahead, turn = stored((jnp.ravel(ahead), jnp.ravel(nearby.cut.turn)))
+
+    def walk(slot: Array, exists: Array, known: tuple[Array, Array]) -> tuple[Array, Array]:
+        way = stored(jnp.searchsorted(number, slot + 1, method="scan_unrolled"))
+        way = jnp.minimum(way, 9 * n - 1)
+        ray = stored(way % n)
+        line = stored(Line(*(column[..., ray] for column in nearby.line)))
+        end = own[ray]
+
+        def step(state: tuple[Array, _Ways]) -> tuple[Array, _Ways]:
+            steps, ways = state
+            cut = cut_by(line, face_corners(geometry, ways.face))
+            on = ways.goes & (cut.turn * ways.turn > 0)
+            stops = on & (cut.corner == 3) & (cut.stops > 0)
+            on = on & (cut.corner < 3)
+            ahead = _across(neighbors, ways.face, cut.corner)
+            lost = ways.lost | (on & (ahead < 0))
+            on = on & (ahead >= 0) & (ahead != end)
+            return steps + 1, stored(_Ways(ahead, cut.turn, on, ways.stops | stops, lost))
+
+        def is_on_the_way(state: tuple[Array, _Ways]) -> Array:
+            return (state[0] < _STEPS) & jnp.any(state[1].goes)
+
+        start = _Ways(ahead[way], turn[way], exists, exists & False, exists & False)
+        _, ways = lax.while_loop(is_on_the_way, step, (jnp.sum(way) & 0, stored(start)))
+        hidden, unknown = known
+        lost = (ways.lost | ways.goes) & (way // n == 4)
+        return hidden.at[ray].max(ways.stops), unknown.at[ray].max(lost)
+
+    slots = jnp.arange(-(-9 * n // _WAYS_AT_ONCE) * _WAYS_AT_ONCE, dtype=jnp.int32)
+    return over_batches(slots, number[-1], _WAYS_AT_ONCE, walk, (hidden, unknown))
 
 
-def _hidden_by_small(pictures: Pictures, rays: Rays, nearby: Nearby) -> Bool[Array, " n"]:
+def _across(
+    neighbors: Int[Array, "F 3"], face: Int[Array, "*n"], corner: Int[Array, "*n"]
+) -> Array:
+    """The face across the edge opposite to a corner; -1 where there is none."""
+    beside = stored(neighbors[jnp.maximum(face, 0), jnp.minimum(corner, 2)])
+    return jnp.where(corner < 3, beside, -1)
+
+
+def _hidden_by_small(
+    pictures: Pictures,
+    rays: Rays,
+    nearby: Nearby,
+    own_slopes: list[Array],
+    before: Float[Array, " n"],
+) -> Bool[Array, " n"]:
     """Whether points lie behind the nearest texel, of faces too small for a texel each.
 
     What is compared are the planes of the point's own face and of the nearest texel's, with a
     margin for surfaces that curve from one to the other.
     """
-    own_slopes, _ = _slopes(pictures, rays, nearby.own)
     slopes, area = _slopes(pictures, rays, nearby.corners[:, :, 4])
-    texel = _texel_of(pictures, rays)
-    at = texel.x, texel.y
-    behind = nearby.key[4] - rays.key
-    behind = behind + own_slopes[0] * at[0] + own_slopes[1] * at[1]
-    margin = jnp.abs((slopes[0] - own_slopes[0]) * at[0])
-    margin = margin + jnp.abs((slopes[1] - own_slopes[1]) * at[1])
-    margin = margin + _ROUNDINGS * jnp.finfo(margin.dtype).eps * rays.unit
+    texel = texel_of(pictures, rays)
+    margin = jnp.abs((slopes[0] - own_slopes[0]) * texel.x)
+    margin = margin + jnp.abs((slopes[1] - own_slopes[1]) * texel.y)
+    margin = margin + ROUNDINGS * jnp.finfo(margin.dtype).eps * rays.unit
     face = nearby.face[4]
     shown = jnp.any(nearby.face == rays.face, axis=0)
-    hidden = (face >= 0) & (face != rays.face) & (behind > margin)
+    hidden = (face >= 0) & (face != rays.face) & (before > margin)
     return hidden & ((area < _SMALL) | ~shown)
-
-
-def _stops(corners: Array, ray: Array, *, endless: Array) -> Array:
-    """Positive where faces, given from the beginning of rays, stop them before their end."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = cross_rows(b - a, c - a)
-    along, distance = dot_columns(normal, ray), dot_columns(normal, a)
-    sign = jnp.where(along < 0, -1, 1)
-    inside = along != 0
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside = inside & (sign * dot_columns(ray, cross_rows(start, end)) >= 0)
-    rounding = dot_columns(jnp.abs(normal), jnp.max(jnp.abs(corners), axis=1))
-    rounding = rounding * (_ROUNDINGS * jnp.finfo(corners.dtype).eps)
-    before = sign * distance
-    before = jnp.where(endless, before, jnp.minimum(before, sign * along - before))
-    return stored(jnp.where(inside, before - rounding, -1))
 
 
 def _slopes(pictures: Pictures, rays: Rays, corners: Array) -> tuple[list[Array], Array]:

@@ -24,8 +24,8 @@ from diffrast.edges.planes import edge_functions
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution
-from diffrast.shadows.lit import Rays, face_corners, faces_near
 from diffrast.shadows.maps import Pictures
+from diffrast.shadows.near import Rays, face_corners, faces_near, seen_by_light
 from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
@@ -164,14 +164,7 @@ def _edge_between(
         stored(jnp.stack(positions_at(geometry, points))) for points in (dark, bright)
     )
     picture = stored(_picture(lamps, lamp, at_dark - pictures.plan.origin[lamps.first][lamp].T))
-    origin = stored(pictures.plan.origin[picture].T)
-    matrix = stored(jnp.moveaxis(pictures.plan.matrix[picture][:, :3], 0, 2))  # (x y w, 4, n)
-
-    def seen(place: Array) -> Array:
-        """x, y and w in the light's picture of places (3, ..., n)."""
-        x, y, z = (place[i] - origin[i] for i in range(3))
-        return jnp.stack([r[0] * x + r[1] * y + r[2] * z + r[3] for r in matrix])
-
+    seen = seen_by_light(pictures, picture)
     ends = []
     for end in (at_dark, at_bright):
         x, y, w = seen(end)
@@ -189,7 +182,7 @@ def _edge_between(
     )
     nearby = faces_near(pictures, geometry, rays)
     part, _, _ = _leaves(stored(seen(nearby.corners)), ends)
-    part = stored(jnp.where((nearby.stops > 0) & (part < 2), part, -1))
+    part = stored(jnp.where((nearby.cut.stops > 0) & (part < 2), part, -1))
     farthest = jnp.max(part, axis=0)
     nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
     row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))

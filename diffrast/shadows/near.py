@@ -1,0 +1,140 @@
+"""The faces near rays to lights, and where rays pass faces.
+
+Which faces are near is read from lights' pictures. Everything is cut relative to a corner of the
+face on which a ray begins, so that no bias is needed but for rounding.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from diffrast._stored import stored
+from diffrast.edges.planes import cross_rows
+from diffrast.geometry import Geometry
+from diffrast.light import dot_columns
+from diffrast.shadows.maps import Pictures
+
+ROUNDINGS = 32  # units in the last place
+
+
+class Rays(NamedTuple):
+    """Points on faces and the pictures that may show them; all of one shape (n,)."""
+
+    face: Int[Array, " n"]
+    barycentrics: Float[Array, "3 n"]
+    picture: Int[Array, " n"]
+    x: Float[Array, " n"]  # in texels
+    y: Float[Array, " n"]
+    key: Float[Array, " n"]
+    unit: Float[Array, " n"]  # of the key, for rounding errors
+    asked: Bool[Array, " n"]  # false where the light does not shine
+
+
+class Line(NamedTuple):
+    """Rays, and where they begin: at a point from the first corner of the face there."""
+
+    corner: Float[Array, "3 n"]
+    point: Float[Array, "3 n"]
+    ray: Float[Array, "3 n"]
+    endless: Bool[Array, " n"]
+
+
+class Cut(NamedTuple):
+    """Where rays pass faces."""
+
+    stops: Float[Array, "*n"]  # positive for faces that stop the ray
+    turn: Float[Array, "*n"]  # -1 or 1: the side that faces turn to the light; 0 edge-on
+    corner: Int[Array, "*n"]  # opposite to the edge beyond which the ray lies farthest; 3: inside
+
+
+class Nearby(NamedTuple):
+    """The faces at the 3×3 texels round rays; corners are x, y and z by rows."""
+
+    face: Int[Array, "9 n"]
+    key: Float[Array, "9 n"]
+    corners: Float[Array, "3 3 9 n"]
+    own: Float[Array, "3 3 n"]  # of the face on which the ray begins
+    cut: Cut
+    line: Line
+
+
+class Texel(NamedTuple):
+    """Texels, and where points lie from their centres."""
+
+    row: Int[Array, " n"]
+    column: Int[Array, " n"]
+    x: Float[Array, " n"]
+    y: Float[Array, " n"]
+
+
+def texel_of(pictures: Pictures, rays: Rays) -> Texel:
+    """The texels in which rays begin."""
+    last = pictures.face.shape[1] - 1
+    column, row = (jnp.clip(jnp.floor(at), 0, last).astype(jnp.int32) for at in (rays.x, rays.y))
+    return Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
+
+
+def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
+    """The faces at the 3×3 texels round rays, and which of them stop these."""
+    texel = texel_of(pictures, rays)
+    last = pictures.face.shape[1] - 1
+    nine = jnp.arange(9)[:, None]
+    row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
+    column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
+    around = stored(pictures.face[rays.picture, row, column])
+    own, others = face_corners(geometry, rays.face), face_corners(geometry, around)
+    origin = own[:, 0]
+    total = jnp.sum(rays.barycentrics, axis=0)
+    shares = rays.barycentrics / jnp.where(total == 0, 1, total)
+    point = shares[1] * (own[:, 1] - origin) + shares[2] * (own[:, 2] - origin)
+    source = pictures.plan.source[rays.picture].T
+    ray = (source[:3] - source[3] * origin) - source[3] * point
+    line = stored(Line(origin, point, ray, source[3] == 0))
+    cut = cut_by(Line(*(column[..., None, :] for column in line)), others)
+    foreign = (around >= 0) & (around != rays.face)
+    cut = cut._replace(stops=jnp.where(foreign, cut.stops, -1))
+    key = pictures.texel[rays.picture, row, column, 0]
+    return Nearby(around, key, others, own, cut, line)
+
+
+def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:
+    """Cut rays with faces, everything relative to where the rays begin."""
+    corners = stored((corners - line.corner[:, None]) - line.point[:, None])
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = cross_rows(b - a, c - a)
+    along = dot_columns(normal, line.ray)
+    sides = [dot_columns(line.ray, cross_rows(*edge)) for edge in ((b, c), (c, a), (a, b))]
+    distance = dot_columns(normal, a)
+    extent = jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.abs(c))
+    rounding = dot_columns(jnp.abs(normal), extent)
+    rounding = rounding * (ROUNDINGS * jnp.finfo(corners.dtype).eps)
+    along, sides, distance, rounding = stored((along, sides, distance, rounding))
+    sign = jnp.where(along < 0, -1, 1)
+    values = [sign * side for side in sides]
+    least = jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
+    outside = least < 0
+    corner = jnp.where(values[0] == least, 0, jnp.where(values[1] == least, 1, 2))
+    before = sign * distance
+    before = jnp.where(line.endless, before, jnp.minimum(before, sign * along - before))
+    stops = jnp.where((along != 0) & ~outside, before - rounding, -1)
+    return Cut(stops, jnp.sign(along), jnp.where(outside, corner, 3).astype(jnp.int32))
+
+
+def face_corners(geometry: Geometry, face: Int[Array, "*n"]) -> Float[Array, "3 3 *n"]:
+    """x, y and z by rows of the three corners of faces."""
+    return stored(geometry.positions.T[:, geometry.faces.T[:, jnp.maximum(face, 0)]])
+
+
+def seen_by_light(pictures: Pictures, picture: Int[Array, " n"]) -> Callable[[Array], Array]:
+    """The function from places (3, ..., n) to x, y in texels and w in lights' pictures."""
+    origin = stored(pictures.plan.origin[picture].T)
+    matrix = stored(jnp.moveaxis(pictures.plan.matrix[picture][:, :3], 0, 2))  # (x y w, 4, n)
+
+    def seen(place: Array) -> Array:
+        x, y, z = (place[i] - origin[i] for i in range(3))
+        return jnp.stack([r[0] * x + r[1] * y + r[2] * z + r[3] for r in matrix])
+
+    return seen
