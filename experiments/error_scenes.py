@@ -29,7 +29,8 @@ class Contender:
         series: what is joined by a line in the plot.
         setting: what tells it from others of the series.
         image: draws the picture.
-        slopes: the derivatives of the weighted picture by the truth's parameters, if it has any.
+        slopes: the derivatives by the truth's parameters of the picture weighted by one of the
+            truth's fields, given by its number; if it has any.
         truth: what they should be.
         peer: whether it is not ours.
     """
@@ -37,20 +38,21 @@ class Contender:
     series: str
     setting: str
     image: Callable[[], np.ndarray]
-    slopes: Callable[[], np.ndarray] | None
+    slopes: Callable[[int], np.ndarray] | None
     truth: Exact
     peer: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Truths:
-    """How exact pictures are drawn: `pictures` of `samples` a pixel."""
+    """How exact pictures are drawn: `pictures` of `samples` a pixel; and the fields to ask for."""
 
     samples: int = 64
     pictures: int = 8
+    fields: int = 8
 
     def of(self, draw: Draw, size: int, scale: np.ndarray) -> Exact:
-        return exact(draw, size, scale, samples=self.samples, pictures=self.pictures)
+        return exact(draw, size, scale, **dataclasses.asdict(self))
 
     def of_task(self, task: Task, shading: str) -> Exact:
         return self.of(pose_picture(task, shading, self.samples), task.size, pose_steps(task))
@@ -77,12 +79,13 @@ def of_function(
 
     start = jnp.zeros(len(truth.scale))
     image = compiled(draw, start, *arguments)
-    both = compiled(jax.value_and_grad(weighted), start, jnp.asarray(truth.field), *arguments)
+    fields = jnp.asarray(truth.fields)
+    both = jax.jit(jax.value_and_grad(weighted))
     return Contender(
         series,
         setting,
         lambda: np.asarray(image()),
-        lambda: np.asarray(both()[1]) * truth.scale,
+        lambda number: np.asarray(both(start, fields[number], *arguments)[1]) * truth.scale,
         truth,
     )
 

@@ -29,15 +29,15 @@ class Exact:
 
     Attributes:
         images: (pictures, size, size, 3), to be averaged.
-        slopes: (pictures, parameters), of sums of the pictures weighted by `field`.
-        field: smooth, random, (size, size, 3).
+        slopes: (pictures, fields, parameters), of sums of the pictures weighted by `fields`.
+        fields: smooth, random, (fields, size, size, 3).
         scale: (parameters,), changes by which the parameters move things by a pixel or so; slopes
             are by these units.
     """
 
     images: np.ndarray
     slopes: np.ndarray
-    field: np.ndarray
+    fields: np.ndarray
     scale: np.ndarray
 
     def errors(self, image: np.ndarray, slopes: np.ndarray | None = None) -> dict[str, float]:
@@ -51,7 +51,7 @@ class Exact:
             wanted = self.slopes.mean(axis=0)
             norms = np.linalg.norm(slopes) * np.linalg.norm(wanted)
             result["gradient_error"] = relative_error(slopes, wanted)
-            result["gradient_cosine"] = float(slopes @ wanted / norms) if norms else 0.0
+            result["gradient_cosine"] = float(np.vdot(slopes, wanted) / norms) if norms else 0.0
         return result
 
     def own_errors(self) -> dict[str, float]:
@@ -62,7 +62,9 @@ class Exact:
         return {name: errors[name] / 2 for name in ("rmse", "mean_difference", "gradient_error")}
 
 
-def exact(draw: Draw, size: int, scale: np.ndarray, *, samples: int, pictures: int = 1) -> Exact:
+def exact(
+    draw: Draw, size: int, scale: np.ndarray, *, samples: int, pictures: int = 1, fields: int = 1
+) -> Exact:
     """Draw many samples a pixel.
 
     Args:
@@ -72,8 +74,9 @@ def exact(draw: Draw, size: int, scale: np.ndarray, *, samples: int, pictures: i
         samples: a pixel of one picture.
         pictures: how many, a power of two, each shifted by other fractions of the distance of two
             samples (Hammersley's points).
+        fields: how many random ones.
     """
-    field = smooth_field(size)
+    weights = smooth_fields(size, fields)
     bits = _bits(pictures)
     powers = 2 ** np.arange(bits.shape[1])
     shifts = np.stack([bits @ powers, bits @ powers[::-1]], axis=1) + 0.5
@@ -81,8 +84,8 @@ def exact(draw: Draw, size: int, scale: np.ndarray, *, samples: int, pictures: i
     images, found = [], []
     for shift in shifts.tolist():
         images.append(np.asarray(draw(jnp.zeros(len(scale)), tuple(shift)), np.float64))
-        found.append(slopes(draw, field, np.diag(scale), STEP, tuple(shift)))
-    return Exact(np.stack(images), np.stack(found), field, scale)
+        found.append(slopes(draw, weights, np.diag(scale), STEP, tuple(shift)))
+    return Exact(np.stack(images), np.stack(found), weights, scale)
 
 
 def _bits(count: int) -> np.ndarray:
@@ -90,26 +93,29 @@ def _bits(count: int) -> np.ndarray:
     return np.arange(count)[:, None] >> np.arange(round(np.log2(count))) & 1
 
 
-def smooth_field(size: int) -> np.ndarray:
-    """Random weights of a picture, with twelve waves or so across it."""
-    coarse = jnp.asarray(np.random.default_rng(0).normal(size=(12, 12, 3)))
-    return np.asarray(jax.image.resize(coarse, (size, size, 3), "cubic"), np.float64)
+def smooth_fields(size: int, count: int = 1) -> np.ndarray:
+    """Random weights of pictures, with twelve waves or so across them: (count, size, size, 3)."""
+    coarse = jnp.asarray(np.random.default_rng(0).normal(size=(count, 12, 12, 3)))
+    return np.asarray(jax.image.resize(coarse, (count, size, size, 3), "cubic"), np.float64)
 
 
 def slopes(
     draw: Draw,
-    field: np.ndarray,
+    fields: np.ndarray,
     motions: np.ndarray,
     step: float,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Central differences of the picture's sum weighted by a field, along motions."""
+    """Central differences of the picture's sums weighted by fields, along motions.
+
+    Their shape is (fields, motions).
+    """
     found = []
     for motion in motions:
         ahead, behind = (draw(jnp.asarray(sign * motion), shift) for sign in (step, -step))
         change = np.asarray(ahead, np.float64) - np.asarray(behind, np.float64)
-        found.append((change * field).sum() / (2 * step))
-    return np.array(found)
+        found.append(np.einsum("fhwc,hwc->f", fields, change) / (2 * step))
+    return np.stack(found, axis=1)
 
 
 def shifted(camera: dr.Camera, shift: tuple[float, float], size: int) -> dr.Camera:
@@ -162,14 +168,14 @@ def pose_picture(task: Task, shading: str, samples: int) -> Draw:
     return draw
 
 
-def pose_slopes(peer: Peer, truth: Exact) -> np.ndarray:
-    """A renderer's derivative of the weighted sum by the pose."""
-    return peer.gradient(far_target(truth))[POSE] / 2e3 * truth.scale
+def pose_slopes(peer: Peer, truth: Exact, field: int = 0) -> np.ndarray:
+    """A renderer's derivative of the sum weighted by one of the fields, by the pose."""
+    return peer.gradient(far_target(truth.fields[field]))[POSE] / 2e3 * truth.scale
 
 
-def far_target(truth: Exact) -> np.ndarray:
+def far_target(field: np.ndarray) -> np.ndarray:
     """So far away that the squared difference to it is linear in the picture."""
-    return np.float32(-1e3 * truth.field)
+    return np.float32(-1e3 * field)
 
 
 def qualities(task: Task, found: Sequence[Peer], samples: int) -> dict[str, dict[str, Any]]:
@@ -179,14 +185,14 @@ def qualities(task: Task, found: Sequence[Peer], samples: int) -> dict[str, dict
         draw = pose_picture(task, shading, samples)
         truth = truths[shading] = exact(draw, task.size, pose_steps(task), samples=samples)
         # A difference that has converged does not depend on its step.
-        slope = truth.slopes[0]
+        slope = truth.slopes[0, 0]
         along = slope / np.linalg.norm(slope)
-        other = slopes(draw, truth.field, (along * truth.scale)[None], STEP / 2)[0]
+        other = slopes(draw, truth.fields, (along * truth.scale)[None], STEP / 2)[0, 0]
         spreads[shading] = abs(float(other / (along @ slope)) - 1)
     results: dict[str, dict[str, Any]] = {}
     for peer in found:
         truth = truths[peer.shading]
-        found_slopes = pose_slopes(peer, truth) if peer.differentiable else None
+        found_slopes = pose_slopes(peer, truth)[None] if peer.differentiable else None
         result: dict[str, Any] = truth.errors(in_floats(peer.image()), found_slopes)
         if peer.differentiable:
             result["reference_spread"] = spreads[peer.shading]
