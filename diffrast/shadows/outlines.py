@@ -227,8 +227,8 @@ def _follow(
 ) -> Int[Array, " n"]:
     """The edge at which the surface ends, or turns away, on the way from a face."""
 
-    def step(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        face, edge, turn, found, done = state
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        steps, face, edge, turn, found, done = state
         part, corner, volume = _leaves(corners_of(face), ends)
         turned = (edge >= 0) & (volume * turn <= 0)
         found = found | (~done & ((face < 0) | turned) & (edge >= 0))
@@ -236,11 +236,15 @@ def _follow(
         following = neighbors[jnp.maximum(face, 0), corner]
         next_edge = jnp.where(done, edge, 3 * face + corner)
         turn = jnp.where(done, turn, jnp.sign(volume))
-        return stored((jnp.where(done, face, following), next_edge, turn, found, done))
+        face = jnp.where(done, face, following)
+        return stored((steps + 1, face, next_edge, turn, found, done))
+
+    def is_on_the_way(state: tuple[Array, ...]) -> Array:
+        return (state[0] < _STEPS) & ~jnp.all(state[-1])
 
     nothing = jnp.zeros_like(face)
-    start = face, nothing - 1, jnp.zeros_like(ends[0][0]), face < -1, face < 0
-    _, edge, _, found, _ = lax.fori_loop(0, _STEPS, step, start)
+    start = jnp.sum(nothing), face, nothing - 1, jnp.zeros_like(ends[0][0]), face < -1, face < 0
+    _, _, edge, _, found, _ = lax.while_loop(is_on_the_way, step, start)
     return stored(jnp.where(found, _named_once(edge, neighbors), -1))
 
 
