@@ -21,6 +21,8 @@ from diffrast.camera import (
     world_to_clip,
 )
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 RNG = np.random.default_rng(0)
 DEPTHS = {"near": 1.0, "far": 9.0}
 

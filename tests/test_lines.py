@@ -15,6 +15,8 @@ from diffrast.lines.pixels import plan, step_at
 from diffrast.lines.segments import segments_from_pixels
 from diffrast.raster.fixed_point import subpixel_bits
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 SIZE = 24  # one size for most pictures, so that few programs are compiled
 
 

@@ -19,6 +19,8 @@ from diffrast import linalg, shapes
 from diffrast._stored import assemble, stored, stored_rows
 from diffrast.camera import pixel_rays, viewpoint
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 NOISE = np.random.default_rng(0).uniform(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
 
 # ----------------------------------------------------------------------------------- the pictures
