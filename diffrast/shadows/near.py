@@ -36,10 +36,10 @@ class Rays(NamedTuple):
 class Line(NamedTuple):
     """Rays, and where they begin: at a point from the first corner of the face there."""
 
-    corner: Float[Array, "3 n"]
-    point: Float[Array, "3 n"]
-    ray: Float[Array, "3 n"]
-    endless: Bool[Array, " n"]
+    corner: Float[Array, "3 *n"]
+    point: Float[Array, "3 *n"]
+    ray: Float[Array, "3 *n"]
+    endless: Bool[Array, "*n"]
 
 
 class Cut(NamedTuple):

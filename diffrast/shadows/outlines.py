@@ -31,6 +31,8 @@ from diffrast.shadows.views import cube_side, sides
 _AT_ONCE = 256
 _STEPS = 64  # from face to face
 
+_State = tuple[Array, Array, Array, Array, Array, Array]
+
 
 class Parted(NamedTuple):
     """Neighbouring pixels that show one surface, lit at one of them only.
@@ -227,7 +229,7 @@ def _follow(
 ) -> Int[Array, " n"]:
     """The edge at which the surface ends, or turns away, on the way from a face."""
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def step(state: _State) -> _State:
         steps, face, edge, turn, found, done = state
         part, corner, volume = _leaves(corners_of(face), ends)
         turned = (edge >= 0) & (volume * turn <= 0)
@@ -239,7 +241,7 @@ def _follow(
         face = jnp.where(done, face, following)
         return stored((steps + 1, face, next_edge, turn, found, done))
 
-    def is_on_the_way(state: tuple[Array, ...]) -> Array:
+    def is_on_the_way(state: _State) -> Array:
         return (state[0] < _STEPS) & ~jnp.all(state[-1])
 
     nothing = jnp.zeros_like(face)
