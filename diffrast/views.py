@@ -29,17 +29,20 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Float
 
 from diffrast._check import all_instances, array_tree, instance_of, is_concrete, positive_int
+from diffrast._stored import stored
 from diffrast.camera import Camera
 from diffrast.render import render
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
 
 _BLOCK = 8  # views that are summed one after another
-_CHUNK = 4
-_CHUNK_BYTES = 1 << 26
+_CHUNK = 16
+_LEAST = 2  # of one view XLA would compile other arithmetic
+_CHUNK_BYTES = 1 << 24
 _AXIS = "views"
 
 ViewFunction = Callable[[Any, Any], Any]
+Kinds = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of arrays
 
 
 def render_views(
@@ -112,6 +115,10 @@ def map_views(
 
     Raises:
         ValueError: as `render_views`.
+
+    Example:
+        >>> dr.views.map_views(lambda scale, x: scale * x**2, jnp.arange(4.0), 10.0).tolist()
+        [0.0, 10.0, 40.0, 90.0]
     """
     count, chunk, devices = _checked(function, views, shared, chunk, devices)
     if not _known(views, shared):
@@ -149,9 +156,14 @@ def stream_views(
         raise ValueError("views: wanted known numbers; inside of transformations use map_views")
     if count == 0:
         return
-    size = chunk or _usual_chunk(function, views, shared)
-    for first, part in _in_order(_some, function, views, shared, size, devices):
-        number = min(size * max(len(devices), 1), count - first)
+    size = max(chunk or _usual_chunk(function, views, shared), _LEAST)
+    if devices:
+        size = max(min(size, -(-count // len(devices))), _LEAST)
+        each = size * len(devices)
+    else:  # some for each core, by the same program
+        each = chunk or min(size, -(-count // _cores()))
+    for first, part in _in_order(_some, function, views, shared, size, each, devices):
+        number = min(each, count - first)
         yield range(first, first + number), jax.tree.map(lambda x, n=number: x[:n], part)
 
 
@@ -183,7 +195,8 @@ def sum_views(
 
         return lax.scan(add, nothing, views)[0]
     total = None
-    for _, part in _in_order(_block_sum, function, views, shared, _BLOCK, devices):
+    each = _BLOCK * max(len(devices), 1)
+    for _, part in _in_order(_block_sum, function, views, shared, _BLOCK, each, devices):
         for row in range(jax.tree.leaves(part)[0].shape[0]):
             block = jax.tree.map(lambda x, row=row: x[row], part)
             total = block if total is None else jax.tree.map(operator.add, total, block)
@@ -226,9 +239,30 @@ def _one_of(views: Any) -> Any:
 
 
 def _usual_chunk(function: ViewFunction, views: Any, shared: Any) -> int:
+    leaves, structure = jax.tree.flatten((shared, views))
+    kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
+    return _room(function, structure, kinds)
+
+
+@lru_cache(maxsize=64)
+def _room(function: ViewFunction, structure: Any, kinds: Kinds) -> int:
+    """How many results fit into a chunk."""
+    shared, views = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
     one = jax.eval_shape(function, shared, _one_of(views))
     size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(one))
     return int(np.clip(_CHUNK_BYTES // max(size, 1), 1, _CHUNK))
+
+
+def _kept(result: Any) -> Any:
+    """Stores what a function returns, which would else be computed where it is put into place.
+
+    That is one loop on one core, in which nothing is computed once for several values.
+    """
+
+    def keep(x: Any) -> Any:
+        return stored(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x
+
+    return jax.tree.map(keep, result)
 
 
 # ------------------------------------------------------------------------- where numbers are traced
@@ -241,7 +275,7 @@ def _mapped(
     once = jax.checkpoint(function, prevent_cse=False)
 
     def local(shared: Any, part: Any) -> Any:
-        return lax.map(lambda view: once(shared, view), part)
+        return lax.map(lambda view: _kept(once(shared, view)), part)
 
     if len(devices) < 2 or count == 0:
         return local(shared, views)
@@ -271,7 +305,7 @@ def _some(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any
     size = jax.tree.leaves(views)[0].shape[0]
 
     def step(i: Array, results: Any) -> Any:
-        result = function(shared, jax.tree.map(lambda x: x[i], views))
+        result = _kept(function(shared, jax.tree.map(lambda x: x[i], views)))
         return jax.tree.map(lambda row, x: row.at[i].set(x), results, result)
 
     nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), one)
@@ -283,7 +317,7 @@ def _block_sum(function: ViewFunction, shared: Any, views: Any, number: Array) -
     one = jax.eval_shape(function, shared, _one_of(views))
 
     def step(i: Array, total: Any) -> Any:
-        result = function(shared, jax.tree.map(lambda x: x[i], views))
+        result = _kept(function(shared, jax.tree.map(lambda x: x[i], views)))
         return jax.tree.map(lambda all_, x: all_ + x[None], total, result)
 
     nothing = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), one)
@@ -295,7 +329,7 @@ def _program(
     work: Callable[..., Any],
     function: ViewFunction,
     structure: Any,
-    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...],
+    kinds: Kinds,
     devices: tuple[jax.Device, ...],
     number: np.dtype,
 ) -> Callable[..., Any]:
@@ -337,17 +371,18 @@ def _in_order(
     views: Any,
     shared: Any,
     size: int,
+    each: int,
     devices: tuple[jax.Device, ...],
 ) -> Iterator[tuple[int, Any]]:
-    """Pairs (first view, result of `work`) of chunks of `size` views, for each device one."""
+    """Pairs (first view, result of `work`) of `each` views, in rooms of `size` for each device."""
     views = jax.tree.map(np.asarray, views)
-    shared = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), shared)
-    count, step = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
+    shared = jax.tree.map(_as_array, shared)
+    count, rows_at_once = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
 
     def chunk(first: int) -> Any:
         def rows(x: np.ndarray) -> np.ndarray:
-            part = x[first : first + step]
-            return np.concatenate([part, np.repeat(part[-1:], step - len(part), axis=0)])
+            part = x[first : min(first + each, count)]
+            return np.concatenate([part, np.repeat(part[-1:], rows_at_once - len(part), axis=0)])
 
         return jax.tree.map(rows, views)
 
@@ -356,19 +391,28 @@ def _in_order(
     program = _program(work, function, structure, kinds, devices, jnp.result_type(float))
 
     def draw(first: int) -> Any:
-        result = program(shared, chunk(first), np.int32(min(step, count - first)))
+        result = program(shared, chunk(first), np.int32(min(each, count - first)))
         return jax.tree.map(_on_host, jax.block_until_ready(result))
 
+    if count <= each:
+        yield 0, draw(0)
+        return
     workers = 1 if devices else _cores()
     waiting: deque[tuple[int, Future[Any]]] = deque()
     with ThreadPoolExecutor(workers) as pool:
-        for first in range(0, count, step):
+        for first in range(0, count, each):
             waiting.append((first, pool.submit(draw, first)))
             if len(waiting) > workers:
                 number, result = waiting.popleft()
                 yield number, result.result()
         for number, result in waiting:
             yield number, result.result()
+
+
+def _as_array(x: Any) -> Array:
+    """With a type of its own, not that of a number in the code."""
+    known = isinstance(x, Array) and not x.weak_type
+    return x if known else jnp.asarray(x, jnp.result_type(x))
 
 
 def _on_host(x: Array) -> Any:

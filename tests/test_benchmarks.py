@@ -9,6 +9,7 @@ import benchmark_features
 import benchmark_peers
 import benchmark_scaling
 import benchmark_stages
+import benchmark_views
 import error_scenes
 import exactness
 import numpy as np
@@ -16,6 +17,8 @@ import peers
 import pytest
 import renderer
 import timing
+
+import diffrast as dr
 
 SPHERE = "sphere, 5,120 faces"
 
@@ -273,3 +276,26 @@ def test_a_wrong_picture_of_a_feature_is_not_timed():
     variant = benchmark_features.Variant()
     with pytest.raises(AssertionError, match="plain: the picture is wrong"):
         benchmark_features.check("plain", variant, np.zeros((4, 4, 3)))
+
+
+def test_views_are_timed(tmp_path):
+    ball = {"ball": lambda: dr.shapes.icosphere(1)}
+    report = benchmark_views.run(
+        tmp_path,
+        meshes=ball,
+        counts={16: (1, 3)},
+        gradients={16: (2,)},
+        repeats=1,
+        antialias=False,
+        elsewhere_too=False,
+    )
+    written = read(tmp_path, "benchmark_views")["throughput"]
+    assert [(row["kind"], row["views"]) for row in written] == [
+        ("picture", 1),
+        ("picture", 3),
+        ("gradient", 2),
+    ]
+    assert all(row["ms"] > 0 for row in report["throughput"])
+    more = {"cores": {1: {"picture": 2.0}, 2: {"picture": 1.0}}, "peak_megabytes": {"16 views": 3}}
+    more["same_bits"] = {"chunks": [1], "devices": [2]}
+    assert "2 cores over one: picture 2.00." in benchmark_views.table(report | more)

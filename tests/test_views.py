@@ -35,7 +35,7 @@ def singles():
     return np.stack([dr.render(scene(), camera(turn), SETTINGS) for turn in TURNS])
 
 
-@pytest.mark.parametrize("options", [{}, {"chunk": 3}])
+@pytest.mark.parametrize("options", [{}, {"chunk": 1}, {"chunk": 3}])
 def test_views_are_those_of_single_calls(singles, options):
     np.testing.assert_array_equal(dr.render_views(scene(), CAMERAS, SETTINGS, **options), singles)
 
@@ -116,23 +116,29 @@ def test_gradient_through_the_views(singles):
     np.testing.assert_allclose(difference, gradient @ step, rtol=2e-2)
 
 
+def slope(direction, camera):
+    return jax.grad(lambda d: jnp.sum(dr.render(scene(d), camera, SETTINGS) ** 2))(direction)
+
+
 MANY_DEVICES = """
 import jax, numpy as np
-jax.config.update("jax_num_cpu_devices", 4)
+jax.config.update("jax_num_cpu_devices", 8)
 import diffrast as dr
 import test_views as t
 from diffrast import views
 
-images, sums = [], []
+images, sums, gradients = [], [], []
 for devices in (None, jax.devices()[:3]):
     images.append(dr.render_views(t.scene(), t.CAMERAS, t.SETTINGS, devices=devices))
-for devices in (None, jax.devices()[:1], jax.devices()[:2], jax.devices()):
+for devices in (None, *(jax.devices()[:n] for n in (1, 2, 4, 8))):
     many = np.linspace(0, 1, 41, dtype=np.float32)
     sums.append(views.sum_views(t.wave, many, np.float32(3), devices=devices))
-for other in images[1:]:
-    np.testing.assert_array_equal(other, images[0])
-for other in sums[1:]:
-    np.testing.assert_array_equal(other, sums[0])
+for devices in (None, jax.devices()):
+    many = jax.tree.map(lambda x: np.resize(x, (19, *x.shape[1:])), t.CAMERAS)
+    gradients.append(views.sum_views(t.slope, many, t.DIRECTION, devices=devices))
+for found in (images, sums, gradients):
+    for other in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, other, found[0])
 """
 
 
