@@ -2,9 +2,11 @@
 
 import json
 
+import common
 import fit_light_from_shadow
 import fit_materials
 import fit_pose
+import fit_rig
 import fit_shape
 import fit_texture
 import jax.numpy as jnp
@@ -41,6 +43,33 @@ def test_a_light_is_found_from_its_shadow(tmp_path):
     assert row["found"]["degrees"] < 0.5
     assert json.loads((tmp_path / "fit_light_from_shadow.json").read_text())["seed"] == 0
     assert (tmp_path / "fit_direction_from_shadow.png").is_file()
+
+
+def test_a_rig_of_cameras_is_found_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    def without_edges(mesh, view, height, width, samples):
+        return common.render_view(mesh, view, height, width, samples, antialias=False)
+
+    monkeypatch.setattr(fit_rig, "render_view", without_edges)
+    monkeypatch.setattr(fit_rig, "LEVELS", fit_rig.LEVELS[:1])
+    asked = {"views": 3, "size": 32, "divisions": 2, "steps": 4}
+    report = fit_rig.run(tmp_path / "whole", **asked)
+    errors = [report[key]["light"]["light_0_diffuse"] for key in ("at_start", "found")]
+    assert errors[1] < 0.5 * errors[0]
+    drawn = []
+
+    def interrupt(views):
+        drawn.append(views)
+        if sum(drawn) > 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_rig.run(tmp_path / "broken", told=interrupt, **asked)
+    resumed = fit_rig.run(tmp_path / "broken", **asked)
+    np.testing.assert_array_equal(resumed["losses"], report["losses"])
+    assert resumed["found"] == report["found"]
+    assert (tmp_path / "broken" / "fit_rig.png").is_file()
+    with pytest.raises(ValueError, match="wanted the state of a fit of"):
+        fit_rig.run(tmp_path / "broken", **(asked | {"seed": 1}))
 
 
 def test_a_texture_is_found_from_views(tmp_path):
