@@ -38,8 +38,7 @@ class FitResult:
         loss: that loss. For `least_squares` it is half the sum of the (robust) squares.
         history: losses and more, step by step.
         steps: number of steps tried.
-        renders: number of evaluations of the function. Line searches inside an optimizer are
-            not counted.
+        renders: number of evaluations of the function, with those of optax's line searches.
         derivatives: number of derivative passes besides: reverse passes of `minimize`, forward
             passes (one for each parameter and render) of `least_squares`.
         converged: whether the fit ended because there was nothing left to gain.

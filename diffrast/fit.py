@@ -100,10 +100,12 @@ def minimize(
 
     state = optimizer.init(params)
     best, converged, reason = params, False, f"all {steps} steps taken"
+    renders = 0
     with Log(steps, record_params, progress, callback) as log:
         for step in range(steps + 1):  # the last evaluation only measures what step `steps` gave
             following = _gradient_step(loss, optimizer, params, state, args)
-            value, gradient_norm = map(float, jax.device_get(following[2:]))
+            value, gradient_norm, searched = map(float, jax.device_get(following[2:]))
+            renders += 1
             if not (math.isfinite(value) and math.isfinite(gradient_norm)):
                 if step == 0:
                     raise _not_finite("loss", value, gradient_norm)
@@ -119,13 +121,14 @@ def minimize(
                 reason = "the loss no longer falls" if gradient_norm else "the gradient is zero"
                 break
             params, state = following[:2]
+            renders += int(searched)
     return FitResult(
         params=best,
         loss=min(log.losses),
         history=log.history(),
         steps=step,
-        renders=step + 1,
-        derivatives=step + 1,
+        renders=renders,
+        derivatives=renders,
         converged=converged,
         reason=reason,
         seconds=log.seconds,
@@ -151,8 +154,11 @@ def _gradient_step(
     params: Params,
     state: Any,
     args: tuple[Any, ...],
-) -> tuple[Params, Any, Array, Array]:
-    """Return the next parameters and optimizer state, and the loss and gradient norm here."""
+) -> tuple[Params, Any, Array, Array, Array]:
+    """Return the next parameters and optimizer state, loss and gradient norm, and evaluations.
+
+    These are the ones of a line search, as optax's own tell their number.
+    """
 
     def value_of(params: Params) -> Array:
         value = jnp.asarray(loss(params, *args))
@@ -165,7 +171,8 @@ def _gradient_step(
         gradient, state, params, value=value, grad=gradient, value_fn=value_of
     )
     gradient_norm = linalg.norm(ravel_pytree(gradient)[0])
-    return optax.apply_updates(params, updates), state, value, gradient_norm
+    searched = jnp.asarray(optax.tree_utils.tree_get(state, "num_linesearch_steps", 0))
+    return optax.apply_updates(params, updates), state, value, gradient_norm, searched
 
 
 def least_squares(
@@ -216,6 +223,12 @@ def least_squares(
     Raises:
         ValueError: for parameters that are not real and finite, and for residuals or
             a Jacobian that are not finite at the start.
+
+    Example:
+        >>> times, places = jnp.arange(4.0), jnp.array([1.0, 3, 5, 7])
+        >>> found = dr.fit.least_squares(lambda p: p[0] + p[1] * times - places, jnp.zeros(2))
+        >>> found.params.round(4).tolist()
+        [1.0, 2.0]
     """
     _check_function("residuals", residuals)
     params = _float_tree(params)

@@ -1,29 +1,35 @@
-"""From how far away is the camera found, and by which method?
+"""From how far away are camera and light found, and by which method?
 
     python experiments/fit_robustness.py
+    python experiments/fit_robustness.py --problems camera --starts 50
 
-Random starts, turned about the teapot by up to 25 degrees round any axis and up to 15 % nearer or
-farther, are fitted to one picture of it, rendered with four times the samples of the fit. Both
-methods see the same blurred differences, coarse to fine; lights and material are known. A fit
-counts as converged if the rotation ends within 0.2 degrees and the eye within 0.5 % of its
-distance, which is a tenth of a pixel of these small pictures.
+Three problems, each with random starts. "camera": turned about the teapot by up to 30 degrees,
+round any axis, and up to 15 % nearer or farther. "light": it shines from anywhere, half to twice as
+strong. "both": both at once. They are fitted to one picture of 128 x 128, rendered with four times
+the samples of the last level. All methods see the same blurred differences, coarse to fine:
+Levenberg-Marquardt, Adam (60 steps a level, their size falling along a cosine) and L-BFGS (with
+optax's line search). A start counts as converged if rotation and light end within 0.1 degrees and
+the eye within 0.1 % of its distance.
 
-Expected: all starts converge with Levenberg-Marquardt, in about 18 renders each, each with its
-derivative by the seven camera parameters. Adam takes all its steps, 122 renders, and leaves about a
-quarter of the starts outside: nearly all of these have found the rotation, but creep along the
-valley in which distance and angle of view make up for each other.
+As many fits run side by side as there are cores, so the seconds are those of a busy machine. After
+each start the report is written; work that was interrupted goes on there.
 
-Written to `--out`: `fit_robustness.json` with every start, and `fit_robustness.png` with the final
-errors by the angle of the start and by the renders used.
+Expected: see the README. Written to `--out`: `fit_robustness.json` with every start,
+`fit_robustness.png` with the errors at the end by those of the start and by the renders used, and
+for each method `failures_*.png`: target, start and result of the first starts that failed.
 """
 
 import dataclasses
 import functools
+import json
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -31,53 +37,79 @@ from common import (
     DEFAULT_TARGET,
     View,
     load_problem,
+    progress_bar,
     pyplot,
     random_start_options,
     render_view,
     save_json,
+    show_fit,
     statistics,
 )
-from fitting import (
-    RADIUS,
-    Level,
-    fit_level,
-    moving,
-    residual_function,
-)
+from fitting import RADIUS, Level, Patience, fit_level, moving, residual_function
 from jax import Array
 from parameters import (
     CAMERA_PARAMETERS,
+    Params,
     Start,
-    camera_errors,
     moved_camera,
     start_of,
+    start_parameters,
+    view_errors,
+    view_of,
 )
 
 import diffrast as dr
 
-CRITERION = {"rotation_degrees": 0.2, "eye_percent": 0.5}  # a tenth of a pixel of 64
+PROBLEMS = {
+    "camera": {"camera": True, "lights": False},
+    "light": {"camera": False, "lights": True},
+    "both": {"camera": True, "lights": True},
+}
+CRITERION = {"rotation_degrees": 0.1, "eye_percent": 0.1, "light_0_degrees": 0.1}
+ADAM_RATES = (0.03, 0.01, 0.003)  # of the levels
+METHODS = ("levenberg_marquardt", "adam", "l_bfgs")
 
 
-def levels_for(size: int, steps: int) -> list[Level]:
-    """Blur by a sixteenth of the picture, then by one pixel, with all seven parameters."""
-    return [Level(1, 16, size / 16, steps, False), Level(1, 16, 1.0, steps, True)]
+def levels_for(size: int) -> list[Level]:
+    """Half size, blurred by a sixteenth of the picture, then full size, then more samples."""
+    return [
+        Level(2, 4, size / 32, 20, False),
+        Level(1, 4, 1.0, 20, True),
+        Level(1, 16, 0.5, 10, True),
+    ]
 
 
-def random_camera(
-    generator: np.random.Generator, truth: Start, degrees: float
-) -> tuple[dict[str, Any], float]:
-    """Return a camera up to so many degrees and 15 % of the distance away, and the angle."""
-    axis = generator.normal(size=3)
-    angle = np.radians(generator.uniform(0, degrees))
-    parameters = np.zeros(CAMERA_PARAMETERS, np.float32)
-    parameters[:3] = angle * axis / np.linalg.norm(axis)
-    parameters[5] = -np.log(generator.uniform(0.85, 1.15))
-    return moved_camera(truth, jnp.asarray(parameters)), float(np.degrees(angle))
+def random_start(
+    problem: str, mesh: dr.Mesh, truth: View, degrees: float, generator: np.random.Generator
+) -> View:
+    """What is to be found, away from the truth."""
+    camera, (light,) = truth.camera, truth.lights
+    if PROBLEMS[problem]["camera"]:
+        axis = generator.normal(size=3)
+        parameters = np.zeros(CAMERA_PARAMETERS, np.float32)
+        angle = np.radians(generator.uniform(0, degrees))
+        parameters[:3] = angle * axis / np.linalg.norm(axis)
+        parameters[5] = -np.log(generator.uniform(0.85, 1.15))
+        camera = moved_camera(start_of(mesh, truth), jnp.asarray(parameters))
+    if PROBLEMS[problem]["lights"]:
+        strength = np.float32(2 ** generator.uniform(-1, 1))
+        light = dataclasses.replace(
+            light,
+            direction=jnp.asarray(generator.normal(size=3), jnp.float32),
+            diffuse=strength * light.diffuse,
+            specular=strength * light.specular,
+        )
+    return dataclasses.replace(truth, camera=camera, lights=(light,))
 
 
-def fit_with_lm(start: Start, target: Array, levels: list[Level]) -> tuple[Any, int]:
+# Methods ------------------------------------------------------------------------------------------
+
+
+def fit_with_lm(
+    start: Start, target: Array, params: Params, levels: list[Level], steps: int
+) -> tuple[Params, int]:
     """Return parameters and renders of a fit by Levenberg-Marquardt steps."""
-    params, renders = {"camera": jnp.zeros(CAMERA_PARAMETERS)}, 0
+    renders = 0
     for level in levels:
         result = fit_level(start, target, params, level)
         params, renders = result.params, renders + result.renders
@@ -85,129 +117,224 @@ def fit_with_lm(start: Start, target: Array, levels: list[Level]) -> tuple[Any, 
 
 
 @functools.cache
-def adam_loss(height: int, width: int, samples: int) -> Callable[..., Array]:
-    """Mean square of the residuals, relative to `scale`."""
-    residuals = residual_function(height, width, samples, RADIUS)
+def mean_square(height: int, width: int, samples: int, antialias: bool) -> Callable[..., Array]:
+    """The loss of the other methods, relative to `scale`."""
+    residuals = residual_function(height, width, samples, RADIUS, antialias)
 
     def loss(
-        params: Any, start: Start, target: Array, blur: Array, moving: Array, scale: Array
+        params: Params, start: Start, target: Array, blur: Array, moving: Array, scale: Array
     ) -> Array:
         return jnp.mean(residuals(params, start, target, blur, moving) ** 2) / scale
 
     return loss
 
 
-def fit_with_adam(
-    start: Start, target: Array, levels: list[Level], optimizers: list[Any]
-) -> tuple[Any, int]:
-    """Return parameters and renders of a fit by Adam, one optimizer for each level."""
-    params, renders = {"camera": jnp.zeros(CAMERA_PARAMETERS)}, 0
-    for level, optimizer in zip(levels, optimizers, strict=True):
+@functools.cache
+def optimizer(method: str, level: int, steps: int) -> optax.GradientTransformation:
+    """Always the same object, so that it is compiled once."""
+    if method == "adam":
+        return optax.adam(optax.cosine_decay_schedule(ADAM_RATES[level], steps))
+    return optax.lbfgs()
+
+
+def fit_with_gradients(
+    method: str, start: Start, target: Array, params: Params, levels: list[Level], steps: int
+) -> tuple[Params, int]:
+    """Return parameters and renders of a fit by one of optax's optimizers."""
+    renders = 0
+    for number, level in enumerate(levels):
+        small = dr.fit.downsample(target, level.shrink)
+        scale, blur = jnp.mean(small**2), jnp.float32(level.blur)
         result = dr.fit.minimize(
-            adam_loss(*target.shape[:2], level.samples),
+            mean_square(*small.shape[:2], level.samples, "camera" in params),
             params,
-            args=(start, target, jnp.float32(level.blur), moving(level), jnp.mean(target**2)),
-            optimizer=optimizer,
-            steps=level.steps,
+            args=(start, small, blur, moving(level), scale),
+            optimizer=optimizer(method, number, steps),
+            steps=steps,
+            callback=None if method == "adam" else Patience(),
         )
         params, renders = result.params, renders + result.renders
     return params, renders
 
 
+def fit_with(method: str) -> Callable[..., tuple[Params, int]]:
+    if method == "levenberg_marquardt":
+        return fit_with_lm
+    return functools.partial(fit_with_gradients, method)
+
+
+# Report -------------------------------------------------------------------------------------------
+
+
+def outcome(
+    method: str,
+    start: Start,
+    params: Params,
+    target: Array,
+    truth: View,
+    levels: list[Level],
+    steps: int,
+) -> dict[str, Any]:
+    """Fit from a start; returns errors, parameters, renders, seconds and whether it converged."""
+    before = time.perf_counter()
+    params, renders = fit_with(method)(start, target, params, levels, steps)
+    params = jax.device_get(params)
+    errors = view_errors(view_of(start, params), truth, float(start.size))
+    converged = all(errors[name] <= limit for name, limit in CRITERION.items())
+    seconds = time.perf_counter() - before
+    found = {"converged": converged, "renders": renders, "seconds": seconds, **errors}
+    return found | {"params": params}
+
+
 def run(
     out: Path,
     *,
-    starts: int = 50,
-    size: int = 64,
-    degrees: float = 25.0,
+    problems: Sequence[str] = tuple(PROBLEMS),
+    methods: Sequence[str] = METHODS,
+    starts: int = 200,
+    size: int = 128,
+    degrees: float = 30.0,
     divisions: int = 8,
-    adam_steps: int = 60,
-    lm_steps: int = 20,
+    steps: int = 60,
     seed: int = 0,
-    progress: bool = False,
+    levels: list[Level] | None = None,
+    at_once: int = 1,
+    told: Callable[[], Any] = lambda: None,
 ) -> dict[str, Any]:
-    """Fit from random starts by both methods; see the module's docstring for the result."""
-    started = time.perf_counter()
+    """Fit from random starts, going on from what is in `out`; see the module's docstring.
+
+    Raises:
+        ValueError: if `out` holds the report of other sizes, starts or steps.
+    """
     truth = load_problem(DEFAULT_TARGET).truth
     assert truth is not None
     mesh = dr.shapes.teapot(divisions)
     target = render_view(mesh, truth, size, size, samples=64)
-    optimizers = [
-        optax.adam(optax.cosine_decay_schedule(rate, adam_steps)) for rate in (0.03, 0.005)
-    ]
-    methods: dict[str, Callable[[Start], tuple[Any, int]]] = {
-        "levenberg_marquardt": lambda start: fit_with_lm(start, target, levels_for(size, lm_steps)),
-        "adam": lambda start: fit_with_adam(
-            start, target, levels_for(size, adam_steps), optimizers
-        ),
-    }
-    generator = np.random.default_rng(seed)
-    true_start = start_of(mesh, truth)
-    rows = []
-    for number in range(starts):
-        camera, angle = random_camera(generator, true_start, degrees)
-        start = start_of(mesh, dataclasses.replace(truth, camera=camera))
-        row: dict[str, Any] = {
-            "angle_degrees": angle,
-            "at_start": camera_errors(camera, truth.camera),
+    asked = {"size": size, "degrees": degrees, "divisions": divisions, "steps": steps, "seed": seed}
+    path = out / "fit_robustness.json"
+    report: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"asked": asked}
+    if report["asked"] != asked:
+        raise ValueError(f"{path}: wanted a report of {asked}, got one of {report['asked']}")
+    report |= {"criterion": CRITERION, "fits_at_once": at_once}
+    levels = levels or levels_for(size)
+
+    def begin(problem: str, number: int) -> View:
+        generator = np.random.default_rng([seed, list(PROBLEMS).index(problem), number])
+        return random_start(problem, mesh, truth, degrees, generator)
+
+    def one(problem: str, method: str, number: int) -> dict[str, Any]:
+        view = begin(problem, number)
+        start = start_of(mesh, view)
+        params = start_parameters(view, **PROBLEMS[problem])
+        errors = view_errors(view, truth, float(start.size))
+        found = outcome(method, start, params, target, truth, levels, steps)
+        told()
+        return {"at_start": errors, **found}
+
+    def left() -> Iterator[tuple[str, str, int]]:
+        for problem in problems:
+            for method in methods:
+                rows = report.setdefault("starts", {}).setdefault(problem, {})
+                done = len(rows.setdefault(method, []))
+                yield from ((problem, method, number) for number in range(done, starts))
+
+    with ThreadPoolExecutor(at_once) as pool:
+        todo = list(left())
+        for (problem, method, _), row in zip(
+            todo, pool.map(one, *zip(*todo, strict=True)) if todo else (), strict=True
+        ):
+            report["starts"][problem][method].append(row)
+            save_json(path, report)
+    report["found"] = {
+        problem: {
+            method: statistics(report["starts"][problem][method], CRITERION) for method in methods
         }
-        row |= {name: _outcome(start, fit, truth) for name, fit in methods.items()}
-        rows.append(row)
-        if progress:
-            found = [name for name in methods if row[name]["converged"]]
-            print(f"start {number + 1} of {starts}, {angle:.0f} degrees: {found}", flush=True)
-    report = {
-        "criterion": CRITERION,
-        "size": size,
-        "degrees": degrees,
-        "seed": seed,
-        "methods": {name: statistics([row[name] for row in rows], CRITERION) for name in methods},
-        "seconds": time.perf_counter() - started,
-        "starts": rows,
+        for problem in problems
     }
-    save_json(out / "fit_robustness.json", report)
-    plot_outcomes(out / "fit_robustness.png", rows, list(methods))
+    save_json(path, report)
+    plot_outcomes(out / "fit_robustness.png", report)
+    for method in methods:
+        failed = [
+            (begin(problem, number), row)
+            for problem in problems
+            for number, row in enumerate(report["starts"][problem][method])
+            if not row["converged"]
+        ]
+        plot_failures(out / f"failures_{method}.png", mesh, target, failed[:6])
     return report
 
 
-def _outcome(start: Start, fit: Callable[[Start], tuple[Any, int]], truth: View) -> dict[str, Any]:
-    """Fit from a start, and return errors, renders, seconds and whether it converged."""
-    before = time.perf_counter()
-    params, renders = fit(start)
-    errors = camera_errors(moved_camera(start, params["camera"]), truth.camera)
-    converged = all(errors[key] <= limit for key, limit in CRITERION.items())
-    seconds = time.perf_counter() - before
-    return {"converged": converged, "renders": renders, "seconds": seconds, **errors}
-
-
-def plot_outcomes(path: Path, rows: list[dict[str, Any]], methods: list[str]) -> None:
-    """Draw the final errors against the angle of the start, and against the renders used."""
+def plot_outcomes(path: Path, report: dict[str, Any]) -> None:
+    """Draw the worst error at the end, in units of the criterion, by start and by renders."""
     plt = pyplot()
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
-    for name in methods:
-        errors = [row[name]["eye_percent"] for row in rows]
-        for axis, values in (
-            (axes[0], [row["angle_degrees"] for row in rows]),
-            (axes[1], [row[name]["renders"] for row in rows]),
-        ):
-            axis.semilogy(values, errors, "o", alpha=0.6, label=name.replace("_", "-"))
-    for axis, label in zip(axes, ("angle of the start (degrees)", "renders"), strict=True):
-        axis.axhline(CRITERION["eye_percent"], color="0.6", zorder=0)
-        axis.set_xlabel(label)
-    axes[1].set_xscale("log")
-    axes[0].set_ylabel("eye error at the end (% of its distance)")
-    axes[0].legend()
+    problems = report["found"]
+    figure, axes = plt.subplots(
+        2, len(problems), figsize=(4.2 * len(problems), 7), layout="constrained", squeeze=False
+    )
+
+    def worst(errors: dict[str, Any]) -> float:
+        return max(errors[name] / limit for name, limit in CRITERION.items())
+
+    for column, problem in enumerate(problems):
+        for method, rows in report["starts"][problem].items():
+            ends = [max(worst(row), 1e-3) for row in rows]
+            places = [worst(row["at_start"]) for row in rows], [row["renders"] for row in rows]
+            for axis, at in zip(axes[:, column], places, strict=True):
+                axis.loglog(at, ends, ".", alpha=0.6, label=method.replace("_", "-"))
+                axis.axhline(1, color="0.6", zorder=0)
+        axes[0, column].set_title(problem)
+        axes[0, column].set_xlabel("worst error at the start / limit")
+        axes[1, column].set_xlabel("renders")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("worst error at the end / limit")
+    axes[0, 0].legend()
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
+def plot_failures(
+    path: Path, mesh: dr.Mesh, target: Array, failed: list[tuple[View, dict[str, Any]]]
+) -> None:
+    """Draw target, start, result and difference of starts; no file where there are none."""
+    path.unlink(missing_ok=True)
+    if not failed:
+        return
+    plt = pyplot()
+    figure, axes = plt.subplots(
+        len(failed), 4, figsize=(8, 2.1 * len(failed)), layout="constrained", squeeze=False
+    )
+    for line, (view, row) in zip(axes, failed, strict=True):
+        params = jax.tree.map(jnp.float32, row["params"], is_leaf=_is_numbers)
+        found = view_of(start_of(mesh, view), params)
+        size = target.shape[0]
+        show_fit(line, target, *(render_view(mesh, v, size, size) for v in (view, found)))
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _is_numbers(value: Any) -> bool:
+    return isinstance(value, list) and not isinstance(value[0], dict)
+
+
 def main() -> None:
-    parser = random_start_options(__doc__, "fit_robustness", starts=50, size=64)
-    parser.add_argument("--degrees", type=float, default=25.0, help="turn the starts by up to")
+    parser = random_start_options(__doc__, "fit_robustness", starts=200, size=128)
+    parser.add_argument("--degrees", type=float, default=30.0, help="turn cameras by up to")
+    parser.add_argument("--problems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument(
+        "--at-once", type=int, default=os.cpu_count() or 1, help="fits side by side"
+    )
     options = vars(parser.parse_args())
-    report = run(options.pop("out"), progress=not options.pop("quiet"), **options)
-    for name, found in report["methods"].items():
-        print(name, found)
+    out, quiet = options.pop("out"), options.pop("quiet")
+    if quiet:
+        report = run(out, **options)
+    else:
+        total = len(options["problems"]) * len(options["methods"]) * options["starts"]
+        with progress_bar(total=total, unit="fit") as bar:
+            report = run(out, told=bar.update, **options)
+    for problem, methods in report["found"].items():
+        for method, found in methods.items():
+            print(problem, method, {k: v for k, v in found.items() if k != "failed"})
 
 
 if __name__ == "__main__":

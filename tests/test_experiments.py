@@ -1,7 +1,6 @@
 """The experiments, at tiny size: what they find and what they write."""
 
 import dataclasses
-import functools
 import json
 import sys
 
@@ -62,21 +61,44 @@ def test_lights_and_material_are_found_for_a_known_camera(problem, tmp_path):
     check_files(tmp_path, problem.name, report)
 
 
-def test_robustness_reports_both_methods(tmp_path, monkeypatch):
-    # The same shapes as in the fit of the camera above, which compiles once for both; the levels
-    # of Adam do so with one optimizer, and without edges, which they do not need to stay far off.
-    optimizer = optax.adam(0.01)
-    monkeypatch.setattr(optax, "adam", lambda rate: optimizer)
-    without_edges = functools.partial(fitting.residual_function, antialias=False)
+def test_robustness_compares_methods_and_goes_on(tmp_path, monkeypatch):
+    # The same shapes as in the fit of the camera above, which compiles once for both; the other
+    # methods' levels do so with one optimizer, and without edges: after two steps they are far off.
+    levels = [fitting.Level(1, 16, 4.0, 20, False), fitting.Level(1, 16, 1.0, 20, True)]
+    optimizers = {"adam": optax.adam(0.01), "l_bfgs": optax.lbfgs()}
+    monkeypatch.setattr(fit_robustness, "optimizer", lambda method, *_: optimizers[method])
+
+    def without_edges(*sizes):
+        return fitting.residual_function(*sizes[:4], False)
+
     monkeypatch.setattr(fit_robustness, "residual_function", without_edges)
-    report = fit_robustness.run(tmp_path, starts=1, size=64, divisions=16, adam_steps=2, seed=1)
-    lm, adam = (report["methods"][name] for name in ("levenberg_marquardt", "adam"))
+    asked = {"problems": ["camera"], "starts": 1, "size": 64, "divisions": 16, "steps": 2}
+    report = fit_robustness.run(tmp_path, levels=levels, **asked)
+    lm, adam, lbfgs = (report["found"]["camera"][name] for name in fit_robustness.METHODS)
     assert lm["median_rotation_degrees"] < 0.5
-    assert adam["share_converged"] == 0  # after two steps a level
+    assert adam["share_converged"] == 0
     assert adam["median_renders"] == 2 * 3
-    assert len(report["starts"]) == 1
-    assert json.loads((tmp_path / "fit_robustness.json").read_text())["seed"] == 1
+    assert lbfgs["median_renders"] > 2 * 3  # line searches are counted
+    stored = json.loads((tmp_path / "fit_robustness.json").read_text())
+    assert [len(rows) for rows in stored["starts"]["camera"].values()] == [1, 1, 1]
     assert (tmp_path / "fit_robustness.png").is_file()
+    assert (tmp_path / "failures_adam.png").is_file()
+
+    told = []
+    again = fit_robustness.run(tmp_path, levels=levels, told=lambda: told.append(1), **asked)
+    assert not told
+    assert again["found"] == stored["found"]
+    with pytest.raises(ValueError, match="wanted a report of"):
+        fit_robustness.run(tmp_path, levels=levels, **(asked | {"steps": 3}))
+
+
+def test_starts_are_as_far_off_as_they_say(problem):
+    generator = np.random.default_rng(0)
+    for name, parts in fit_robustness.PROBLEMS.items():
+        view = fit_robustness.random_start(name, problem.mesh, problem.truth, 30.0, generator)
+        errors = parameters.view_errors(view, problem.truth, 1.0)
+        assert (0.01 < errors["rotation_degrees"] < 30.1) == parts["camera"]
+        assert (errors["light_0_degrees"] > 0.1) == parts["lights"]
 
 
 # The parts they share -----------------------------------------------------------------------------
