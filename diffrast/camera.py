@@ -332,6 +332,13 @@ def clip_to_pixel(
 
     A point in the plane of the eye, w = 0 to within rounding, has no pixel: it gives zeros, with
     zero gradient. Behind the eye 1/w is negative and the pixel is that of the mirrored point.
+
+    Example:
+        >>> eye, target = (0, 0, 4), (0, 0, 0)
+        >>> camera = dr.Camera.perspective(eye=eye, target=target, fov_y=np.pi / 2, near=1, far=9)
+        >>> clip = dr.world_to_clip(camera, jnp.array([[0.0, 0, 0], [2, 2, 0]]))
+        >>> dr.clip_to_pixel(clip, height=64, width=64).round(4).tolist()
+        [[32.0, 32.0, 0.25], [48.0, 16.0, 0.25]]
     """
     positions_clip = float_array("positions_clip", positions_clip, ("...", 4), finite=False)
     size = positive_int("width", width) / 2, positive_int("height", height) / 2

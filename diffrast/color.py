@@ -24,7 +24,12 @@ def srgb_to_linear(encoded: ArrayLike) -> Float[Array, "..."]:
 
 
 def linear_to_srgb(linear: ArrayLike) -> Float[Array, "..."]:
-    """Encode linear light as sRGB values: the inverse of `srgb_to_linear`."""
+    """Encode linear light as sRGB values: the inverse of `srgb_to_linear`.
+
+    Example:
+        >>> dr.color.linear_to_srgb(jnp.array([0.0, 0.214, 1.0])).round(2).tolist()
+        [0.0, 0.5, 1.0]
+    """
     linear = float_array("linear", linear, finite=False)
     straight = linear <= 0.0031308
     curved = jnp.where(straight, 1, linear)
@@ -142,6 +147,11 @@ def look_up(table: LookUpTable, values: ArrayInput) -> Float[Array, "*size chann
 
     Raises:
         ValueError: for values that are no numbers, and anything but a table.
+
+    Example:
+        >>> heat = dr.LookUpTable(positions=[0.0, 1.0], colors=[[0.0, 0, 1], [1, 0, 0]])
+        >>> dr.look_up(heat, jnp.array([-1.0, 0.25])).tolist()
+        [[0.0, 0.0, 1.0], [0.25, 0.0, 0.75]]
     """
     instance_of("table", table, LookUpTable)
     values = float_array("values", values, finite=False)

@@ -35,6 +35,13 @@ def interpolate(
 
     Raises:
         ValueError: for wrong shapes and indices out of range.
+
+    Example:
+        >>> triangle = jnp.array([[-1.0, -1, 0, 1], [3, -1, 0, 1], [-1, 3, 0, 1]])
+        >>> fragments = dr.rasterize(triangle, [[0, 1, 2]], height=2, width=2)
+        >>> across = jnp.array([[0.0], [8], [0]])  # over twice the width of the image
+        >>> dr.interpolate(across, [[0, 1, 2]], fragments)[..., 0].tolist()
+        [[1.0, 3.0], [1.0, 3.0]]
     """
     instance_of("fragments", fragments, Fragments)
     attributes = float_array("attributes", attributes, ("V", "C"), finite=False)

@@ -169,7 +169,15 @@ def shear(
 
 
 def compose(*matrices: ArrayInput) -> Float[Array, "4 4"]:
-    """Product of 4x4 matrices: the rightmost acts first. None at all is the identity."""
+    """Product of 4x4 matrices: the rightmost acts first. None at all is the identity.
+
+    Example:
+        >>> turn = dr.linalg.rotation((0, 0, 1), np.pi / 2)
+        >>> move = dr.linalg.translation((1, 0, 0))
+        >>> both = dr.linalg.compose(move, turn)
+        >>> dr.linalg.transform_points(both, jnp.array([2.0, 0, 0])).round(4).tolist()
+        [1.0, 2.0, 0.0]
+    """
     checked = [float_array(f"matrices[{i}]", m, (4, 4)) for i, m in enumerate(matrices)]
     return functools.reduce(_matmul, checked) if checked else jnp.eye(4)
 

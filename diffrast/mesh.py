@@ -444,6 +444,10 @@ def signed_volume(mesh: Mesh) -> Float[Array, ""]:
     """Volume inside a closed mesh, negative where faces are clockwise from outside.
 
     Differentiable in the positions.
+
+    Example:
+        >>> float(dr.mesh.signed_volume(dr.shapes.cube()))
+        8.0
     """
     _check.instance_of("mesh", mesh, Mesh)
     a, b, c = _corners(mesh.vertices - jnp.mean(mesh.vertices, axis=0), mesh.faces)

@@ -85,6 +85,15 @@ def render(
         ValueError: if the background is an image of another size, the camera is a stack, or an
             argument is another tree of arrays; of what is none JAX makes a TypeError or
             OverflowError.
+
+    Example:
+        >>> ball = dr.Object(dr.shapes.icosphere(2), dr.Material(diffuse=(0.5, 0.5, 0.5)))
+        >>> scene = dr.Scene(objects=[ball], lights=[dr.DirectionalLight(direction=(0, 0, -1))])
+        >>> eye, target = (0, 0, 3), (0, 0, 0)
+        >>> camera = dr.Camera.perspective(eye=eye, target=target, fov_y=0.9, near=1, far=9)
+        >>> settings = dr.RenderSettings(height=9, width=9, antialias=False)
+        >>> dr.render(scene, camera, settings)[4, 4].round(3).tolist()
+        [0.5, 0.5, 0.5]
     """
     _check_kinds(scene, camera, settings)
     side = round(settings.samples**0.5)

@@ -116,6 +116,11 @@ def draw_lines(
 
     Raises:
         ValueError: for wrong shapes, numbers that are not finite, and indices out of range.
+
+    Example:
+        >>> picture = dr.draw_lines([[0.0, 1.0], [3.0, 1.0]], [[0, 1]], height=2, width=3)
+        >>> picture[..., 0].tolist()  # half of its width in either row
+        [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
     """
     points = _check.float_array("points", points, ("points", 2))
     lines, height, width = _checked_lines(lines, points.shape[0], height, width)

@@ -65,6 +65,11 @@ def rasterize(
     Raises:
         ValueError: for wrong shapes, indices out of range, no faces, and clip positions that are
             not finite (while tracing, faces with such positions are not drawn).
+
+    Example:
+        >>> triangle = jnp.array([[-1.0, -1, 0, 1], [1.5, -1, 0, 1], [-1, 1.5, 0, 1]])
+        >>> dr.rasterize(triangle, [[0, 1, 2]], height=3, width=4).face.tolist()
+        [[0, 0, -1, -1], [0, 0, 0, -1], [0, 0, 0, 0]]
     """
     positions_clip = float_array("positions_clip", positions_clip, ("V", 4))
     faces = index_array("faces", faces, ("F", 3), bound=positions_clip.shape[0])

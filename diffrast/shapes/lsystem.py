@@ -183,6 +183,11 @@ class LSystem:
             iterations: how often all symbols are replaced.
             step: how far a symbol moves the turtle.
             key: as for `expand`.
+
+        Example:
+            >>> koch = dr.LSystem(initiator="F", rules={"F": "F+F--F+F"}, angle=np.pi / 3)
+            >>> koch.draw(2).lines.shape
+            (16, 2)
         """
         codes = self._codes(iterations, key)
         step = _check.float_array("step", step, ())

@@ -55,6 +55,11 @@ def sample_texture(
 
     Raises:
         ValueError: for wrong shapes.
+
+    Example:
+        >>> checker = dr.Texture(jnp.array([[[0.0], [1]], [[1], [0]]]), filter="bilinear")
+        >>> dr.sample_texture(checker, jnp.array([[0.25, 0.25], [0.5, 0.25]])).tolist()
+        [[1.0], [0.5]]
     """
     if not isinstance(texture, Texture | CubeTexture):
         raise ValueError(f"texture: wanted a Texture or CubeTexture, got {type(texture).__name__}")
