@@ -16,7 +16,8 @@ import diffrast as dr
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 NAMES = {"jax": jax, "jnp": jnp, "np": np, "dr": dr}
-README = Path(__file__).parent.parent / "README.md"
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
 
 
 def with_examples():
@@ -72,3 +73,15 @@ def test_readme(tmp_path, monkeypatch):
     assert float(jnp.linalg.norm(names["gradient"])) > 0
     assert names["images"].shape == (2, 16, 16, 3)
     assert Path("teapot.png").is_file()
+
+
+def test_the_readme_names_what_there_is():
+    text = README.read_text()
+    for name in set(re.findall(r"`(\w+\.py)`", text)):
+        assert (ROOT / "tests" / name).is_file(), name
+    for name in set(re.findall(r"(?:experiments|diffrast|tests)/[\w/]+\.\w+", text)):
+        assert (ROOT / name).is_file(), name
+    for name in set(re.findall(r"`dr\.([\w.]+)", text)):
+        thing = dr
+        for part in name.split("."):
+            thing = getattr(thing, part)

@@ -128,7 +128,7 @@ import test_views as t
 from diffrast import views
 
 images, sums, gradients = [], [], []
-for devices in (None, jax.devices()[:3]):
+for devices in (None, jax.devices()[:3], jax.devices()):  # more of them than views
     images.append(dr.render_views(t.scene(), t.CAMERAS, t.SETTINGS, devices=devices))
 for devices in (None, *(jax.devices()[:n] for n in (1, 2, 4, 8))):
     many = np.linspace(0, 1, 41, dtype=np.float32)
