@@ -11,6 +11,8 @@ from diffrast.files.bezier import load_bezier, save_bezier
 from diffrast.shapes import bezier_mesh, evaluate, parse_bezier, teapot, teapot_patches
 from diffrast.shapes.teapot import SURFACES
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 DATA = Path(__file__).parent / "data"
 FLAT = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0]), axis=-1)[:, :, 0]
 

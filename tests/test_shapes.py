@@ -7,6 +7,8 @@ from jax.test_util import check_grads
 from diffrast import mesh as dm
 from diffrast import shapes
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 SOLIDS = {  # faces of the solid, corners of a face, corners of the solid, circumradius, volume
     shapes.tetrahedron: (4, 3, 4, np.sqrt(3), 8 / 3),
     shapes.cube: (6, 4, 8, np.sqrt(3), 8),

@@ -10,6 +10,8 @@ import diffrast as dr
 from diffrast.texture.kinds import FILTERS, WRAPS
 from diffrast.texture.pyramid import layout_of, pyramid, rows_of
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 RNG = np.random.default_rng(0)
 IMAGE = RNG.uniform(size=(37, 53, 3)).astype(np.float32)
 
