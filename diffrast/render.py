@@ -297,7 +297,8 @@ def _pixels(color: Columns, side: int) -> Array:
     """The image of pixels from the colours of side × side samples of each."""
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
-    return assemble(stored(color))
+    # A loop over views would else compute the colours where it puts them into place, on one core.
+    return stored(assemble(stored(color)))
 
 
 def _box_average(channel: Array, side: int) -> Array:

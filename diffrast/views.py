@@ -13,36 +13,36 @@ needs of all of them.
 """
 
 import operator
-import os
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
-from jax.sharding import Mesh as DeviceMesh
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import PartitionSpec
 from jaxtyping import Float
 
 from diffrast._check import all_instances, array_tree, instance_of, is_concrete, positive_int
-from diffrast._stored import stored
+from diffrast._chunks import (
+    AXIS,
+    LEAST,
+    ViewFunction,
+    block_sum,
+    cores,
+    device_mesh,
+    in_order,
+    joined,
+    kept,
+    one_of,
+    some_views,
+    usual_chunk,
+)
 from diffrast.camera import Camera
 from diffrast.render import render
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
 
 _BLOCK = 8  # views that are summed one after another
-_CHUNK = 16
-_LEAST = 2  # of one view XLA would compile other arithmetic
-_CHUNK_BYTES = 1 << 24
-_AXIS = "views"
-
-ViewFunction = Callable[[Any, Any], Any]
-Kinds = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of arrays
 
 
 def render_views(
@@ -64,7 +64,7 @@ def render_views(
         cameras: cameras along a leading axis, as `stack_cameras` or `jax.vmap` make them.
         settings: image size and method.
         chunk: views that one call of the compiled program draws; bounds the memory besides that of
-            the result. By default a few.
+            the result. By default up to 16, so many that they take some 16 MB.
         devices: on which to draw; by default all cores, if the default device is the CPU, or else
             that device.
 
@@ -124,11 +124,11 @@ def map_views(
     if not _known(views, shared):
         return _mapped(function, views, shared, count, devices)
     if count == 0:
-        one = jax.eval_shape(function, shared, _one_of(views))
+        one = jax.eval_shape(function, shared, one_of(views))
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), one)
     stream = stream_views(function, views, shared, chunk=chunk, devices=devices or None)
     parts = [part for _, part in stream]
-    return jax.tree.map(lambda *rows: jnp.asarray(_joined(rows)), *parts)
+    return jax.tree.map(lambda *rows: jnp.asarray(joined(rows)), *parts)
 
 
 def stream_views(
@@ -156,13 +156,13 @@ def stream_views(
         raise ValueError("views: wanted known numbers; inside of transformations use map_views")
     if count == 0:
         return
-    size = max(chunk or _usual_chunk(function, views, shared), _LEAST)
+    size = max(chunk or usual_chunk(function, views, shared), LEAST)
     if devices:
-        size = max(min(size, -(-count // len(devices))), _LEAST)
+        size = max(min(size, -(-count // len(devices))), LEAST)
         each = size * len(devices)
     else:  # some for each core, by the same program
-        each = chunk or min(size, -(-count // _cores()))
-    for first, part in _in_order(_some, function, views, shared, size, each, devices):
+        each = chunk or min(size, -(-count // cores()))
+    for first, part in in_order(some_views, function, views, shared, size, each, devices):
         number = min(each, count - first)
         yield range(first, first + number), jax.tree.map(lambda x, n=number: x[:n], part)
 
@@ -187,7 +187,7 @@ def sum_views(
     count, _, devices = _checked(function, views, shared, None, devices)
     if not _known(views, shared) or count == 0:
         step = jax.checkpoint(function, prevent_cse=False)
-        one = jax.eval_shape(function, shared, _one_of(views))
+        one = jax.eval_shape(function, shared, one_of(views))
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
 
         def add(total: Any, view: Any) -> tuple[Any, None]:
@@ -196,7 +196,7 @@ def sum_views(
         return lax.scan(add, nothing, views)[0]
     total = None
     each = _BLOCK * max(len(devices), 1)
-    for _, part in _in_order(_block_sum, function, views, shared, _BLOCK, each, devices):
+    for _, part in in_order(block_sum, function, views, shared, _BLOCK, each, devices):
         for row in range(jax.tree.leaves(part)[0].shape[0]):
             block = jax.tree.map(lambda x, row=row: x[row], part)
             total = block if total is None else jax.tree.map(operator.add, total, block)
@@ -233,38 +233,6 @@ def _known(*trees: Any) -> bool:
     return all(is_concrete(leaf) for leaf in jax.tree.leaves(trees))
 
 
-def _one_of(views: Any) -> Any:
-    """The shape of one view."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x)[1:], jnp.result_type(x)), views)
-
-
-def _usual_chunk(function: ViewFunction, views: Any, shared: Any) -> int:
-    leaves, structure = jax.tree.flatten((shared, views))
-    kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
-    return _room(function, structure, kinds)
-
-
-@lru_cache(maxsize=64)
-def _room(function: ViewFunction, structure: Any, kinds: Kinds) -> int:
-    """How many results fit into a chunk."""
-    shared, views = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
-    one = jax.eval_shape(function, shared, _one_of(views))
-    size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(one))
-    return int(np.clip(_CHUNK_BYTES // max(size, 1), 1, _CHUNK))
-
-
-def _kept(result: Any) -> Any:
-    """Stores what a function returns, which would else be computed where it is put into place.
-
-    That is one loop on one core, in which nothing is computed once for several values.
-    """
-
-    def keep(x: Any) -> Any:
-        return stored(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x
-
-    return jax.tree.map(keep, result)
-
-
 # ------------------------------------------------------------------------- where numbers are traced
 
 
@@ -275,7 +243,7 @@ def _mapped(
     once = jax.checkpoint(function, prevent_cse=False)
 
     def local(shared: Any, part: Any) -> Any:
-        return lax.map(lambda view: _kept(once(shared, view)), part)
+        return lax.map(lambda view: kept(once(shared, view)), part)
 
     if len(devices) < 2 or count == 0:
         return local(shared, views)
@@ -285,149 +253,8 @@ def _mapped(
     )
     all_of = jax.shard_map(
         local,
-        mesh=_mesh(devices),
-        in_specs=(PartitionSpec(), PartitionSpec(_AXIS)),
-        out_specs=PartitionSpec(_AXIS),
+        mesh=device_mesh(devices),
+        in_specs=(PartitionSpec(), PartitionSpec(AXIS)),
+        out_specs=PartitionSpec(AXIS),
     )
     return jax.tree.map(lambda x: x[:count], all_of(shared, padded))
-
-
-def _mesh(devices: tuple[jax.Device, ...]) -> DeviceMesh:
-    return DeviceMesh(np.array(devices), (_AXIS,))
-
-
-# -------------------------------------------------------------------------- where numbers are known
-
-
-def _some(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
-    """Results of the first `number` of some views; zeros for the others."""
-    one = jax.eval_shape(function, shared, _one_of(views))
-    size = jax.tree.leaves(views)[0].shape[0]
-
-    def step(i: Array, results: Any) -> Any:
-        result = _kept(function(shared, jax.tree.map(lambda x: x[i], views)))
-        return jax.tree.map(lambda row, x: row.at[i].set(x), results, result)
-
-    nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), one)
-    return lax.fori_loop(0, number, step, nothing)
-
-
-def _block_sum(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
-    """Sum of results of the first `number` of some views, with a leading axis of one."""
-    one = jax.eval_shape(function, shared, _one_of(views))
-
-    def step(i: Array, total: Any) -> Any:
-        result = _kept(function(shared, jax.tree.map(lambda x: x[i], views)))
-        return jax.tree.map(lambda all_, x: all_ + x[None], total, result)
-
-    nothing = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), one)
-    return lax.fori_loop(0, number, step, nothing)
-
-
-@lru_cache(maxsize=64)
-def _program(
-    work: Callable[..., Any],
-    function: ViewFunction,
-    structure: Any,
-    kinds: Kinds,
-    devices: tuple[jax.Device, ...],
-    number: np.dtype,
-) -> Callable[..., Any]:
-    """The compiled loop over a chunk of views; `number` is the kind of numbers in use."""
-    del number
-    split = PartitionSpec(_AXIS)
-
-    def on_each(shared: Any, views: Any, number: Array) -> Any:
-        size = jax.tree.leaves(views)[0].shape[0]
-        before = lax.axis_index(_AXIS) * size
-        return work(function, shared, views, jnp.clip(number - before, 0, size))
-
-    def alone(shared: Any, views: Any, number: Array) -> Any:
-        return work(function, shared, views, number)
-
-    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
-    shared, views = jax.tree.unflatten(structure, leaves)
-    count = jax.ShapeDtypeStruct((), np.int32)
-    if not devices:
-        return jax.jit(alone).lower(shared, views, count).compile()
-    mesh = _mesh(devices)
-    everywhere, sharded = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), split))
-    # Every device works for itself: what a function does with `shared`, its derivative too, stays
-    # on the device.
-    on_all = jax.shard_map(
-        on_each,
-        mesh=mesh,
-        in_specs=(PartitionSpec(), split, PartitionSpec()),
-        out_specs=split,
-        check_vma=False,
-    )
-    jitted = jax.jit(on_all, in_shardings=(everywhere, sharded, everywhere), out_shardings=sharded)
-    return jitted.lower(shared, views, count).compile()
-
-
-def _in_order(
-    work: Callable[..., Any],
-    function: ViewFunction,
-    views: Any,
-    shared: Any,
-    size: int,
-    each: int,
-    devices: tuple[jax.Device, ...],
-) -> Iterator[tuple[int, Any]]:
-    """Pairs (first view, result of `work`) of `each` views, in rooms of `size` for each device."""
-    views = jax.tree.map(np.asarray, views)
-    shared = jax.tree.map(_as_array, shared)
-    count, rows_at_once = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
-
-    def chunk(first: int) -> Any:
-        def rows(x: np.ndarray) -> np.ndarray:
-            part = x[first : min(first + each, count)]
-            return np.concatenate([part, np.repeat(part[-1:], rows_at_once - len(part), axis=0)])
-
-        return jax.tree.map(rows, views)
-
-    leaves, structure = jax.tree.flatten((shared, chunk(0)))
-    kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    program = _program(work, function, structure, kinds, devices, jnp.result_type(float))
-
-    def draw(first: int) -> Any:
-        result = program(shared, chunk(first), np.int32(min(each, count - first)))
-        return jax.tree.map(_on_host, jax.block_until_ready(result))
-
-    if count <= each:
-        yield 0, draw(0)
-        return
-    workers = 1 if devices else _cores()
-    waiting: deque[tuple[int, Future[Any]]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        for first in range(0, count, each):
-            waiting.append((first, pool.submit(draw, first)))
-            if len(waiting) > workers:
-                number, result = waiting.popleft()
-                yield number, result.result()
-        for number, result in waiting:
-            yield number, result.result()
-
-
-def _as_array(x: Any) -> Array:
-    """With a type of its own, not that of a number in the code."""
-    known = isinstance(x, Array) and not x.weak_type
-    return x if known else jnp.asarray(x, jnp.result_type(x))
-
-
-def _on_host(x: Array) -> Any:
-    """As numpy has it, unless other processes hold a part of it."""
-    return np.asarray(x) if x.is_fully_addressable else x
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    if len(parts) == 1:
-        return parts[0]
-    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
-
-
-def _cores() -> int:
-    """Cores that this process may use, 1 where another device draws."""
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

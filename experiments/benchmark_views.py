@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from common import pyplot
+from orbit import orbit_cameras
 from timing import benchmark_options, compiled, markdown, minimum_times, write_report
 
 import diffrast as dr
@@ -37,35 +38,15 @@ MESHES: dict[str, Callable[[], dr.Mesh]] = {
     "teapot": partial(dr.shapes.teapot, 8),
     "sphere": partial(dr.shapes.icosphere, 4),
 }
-COUNTS = {64: (1, 16, 256, 4096), 256: (1, 16, 256)}
+COUNTS = {64: (1, 16, 256, 4096), 256: (1, 16, 256, 4096)}
 GRADIENTS = {64: (1, 16, 256), 256: (1, 16)}
 QUICK = {16: (1, 2)}
 CHUNKS, DEVICES = (1, 3, 16), (1, 2, 4, 8)
 
 
-def camera(turn: jax.Array, distance: jax.Array) -> dr.Camera:
-    """From round an object in the middle, z up."""
-    way = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.5 + 0 * turn])
-    return dr.Camera.perspective(
-        eye=distance * way,
-        target=(0, 0, 0),
-        up=(0, 0, 1),
-        fov_y=0.7,
-        near=distance / 20,
-        far=distance * 3,
-    )
-
-
 def cameras(mesh: dr.Mesh, count: int) -> dr.Camera:
-    """A circle round the middle of a mesh that was moved there."""
-    size = jnp.max(dr.linalg.norm(mesh.vertices))
-    turns = jnp.linspace(0, 2 * jnp.pi, count, endpoint=False)
-    return jax.vmap(camera, (0, None))(turns, 3 * size)
-
-
-def centred(mesh: dr.Mesh) -> dr.Mesh:
-    low, high = jnp.min(mesh.vertices, axis=0), jnp.max(mesh.vertices, axis=0)
-    return dr.mesh.transform(mesh, dr.linalg.translation(-(low + high) / 2))
+    """A circle round a mesh that fills the picture's height, or nearly."""
+    return orbit_cameras(mesh, count, elevation=0.5, distance=2.0)
 
 
 def scene_of(mesh: dr.Mesh, direction: Any, offset: Any) -> dr.Scene:
@@ -98,9 +79,9 @@ def shared_of(mesh: dr.Mesh, size: int, antialias: bool = True) -> Shared:
     return mesh, settings, PARAMETERS
 
 
-def forgotten(shared: Shared, views: dr.Camera, **options: Any) -> None:
+def forgotten(shared: Shared, views: dr.Camera) -> None:
     """Draw views and keep none."""
-    for _ in dr.views.stream_views(picture, views, shared, **options):
+    for _ in dr.views.stream_views(picture, views, shared):
         pass
 
 
@@ -141,7 +122,7 @@ def throughput(
     """Milliseconds a view, by mesh, size, kind and number of views."""
     rows = []
     for name, make in meshes.items():
-        mesh = centred(make())
+        mesh = make()
         for size in counts:
             jobs = jobs_of(mesh, size, counts[size], gradients[size], antialias)
             times = minimum_times(jobs, repeats)
@@ -158,7 +139,7 @@ def throughput(
 
 def memory(size: int, *counts: int) -> dict[str, float]:
     """Peaks after pictures of a few views, and then of more."""
-    mesh, found = centred(MESHES["sphere"]()), {}
+    mesh, found = MESHES["sphere"](), {}
     for count in counts:
         forgotten(shared_of(mesh, size), cameras(mesh, count))
         found[f"{count} views of {size}²"] = peak_megabytes()
@@ -167,7 +148,7 @@ def memory(size: int, *counts: int) -> dict[str, float]:
 
 def cores_gain(size: int, count: int, repeats: int) -> dict[str, float]:
     """Milliseconds a view on the cores that this process may use."""
-    mesh = centred(MESHES["sphere"]())
+    mesh = MESHES["sphere"]()
     times = minimum_times(jobs_of(mesh, size, [count], [count]), repeats)
     return {kind: times[kind, count] / count for kind in ("picture", "gradient")}
 
@@ -178,7 +159,7 @@ def same_bits(size: int, count: int) -> dict[str, list[int]]:
     Raises:
         AssertionError: if a bit differs.
     """
-    mesh = centred(MESHES["sphere"]())
+    mesh = MESHES["sphere"]()
     shared, views = shared_of(mesh, size), cameras(mesh, count)
     want = np.asarray(dr.views.map_views(picture, views, shared))
     sums = dr.views.sum_views(gradient, views, shared)
@@ -213,10 +194,10 @@ def run(
     gradients: dict[int, Any] = GRADIENTS,
     repeats: int = 5,
     antialias: bool = True,
-    elsewhere_too: bool = True,
+    elsewhere_too: bool = hasattr(os, "sched_setaffinity"),
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Measure, if wanted also what needs processes of its own; returns what is written."""
+    """Measure, if wanted also what needs own processes (on Linux); return what is written."""
     rows = throughput(meshes, counts, gradients, repeats, antialias=antialias, progress=progress)
     report: dict[str, Any] = {"throughput": rows}
     if elsewhere_too:

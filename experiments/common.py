@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -284,9 +284,27 @@ def statistics(outcomes: list[dict[str, Any]], criterion: dict[str, float]) -> d
 
 
 def save_json(path: Path, content: Any) -> None:
-    """Write a result; arrays become lists, floats keep six digits."""
+    """Write a result, all or nothing; arrays become lists, floats keep six digits."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_plain(content), indent=1) + "\n")
+    text = json.dumps(_plain(content), indent=1) + "\n"
+    save_whole(path, lambda unfinished: unfinished.write_text(text))
+
+
+def save_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file under another name in its folder, which becomes its own when it is whole."""
+    unfinished = path.with_name(f"unfinished-{path.name}")
+    write(unfinished)
+    unfinished.replace(path)
+
+
+def check_same(path: Path, kind: str, wanted: Any, got: Any) -> None:
+    """See that what an interrupted run left in a file is of the kind asked for.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if got != wanted:
+        raise ValueError(f"{path}: wanted {kind} of {wanted}, got one of {got}")
 
 
 def _plain(value: Any) -> Any:

@@ -36,6 +36,7 @@ import optax
 from common import (
     DEFAULT_TARGET,
     View,
+    check_same,
     load_problem,
     progress_bar,
     pyplot,
@@ -106,7 +107,7 @@ def random_start(
 
 
 def fit_with_lm(
-    start: Start, target: Array, params: Params, levels: list[Level], steps: int
+    start: Start, target: Array, params: Params, levels: list[Level]
 ) -> tuple[Params, int]:
     """Return parameters and renders of a fit by Levenberg-Marquardt steps."""
     renders = 0
@@ -138,7 +139,7 @@ def optimizer(method: str, level: int, steps: int) -> optax.GradientTransformati
 
 
 def fit_with_gradients(
-    method: str, start: Start, target: Array, params: Params, levels: list[Level], steps: int
+    method: str, start: Start, target: Array, params: Params, levels: list[Level]
 ) -> tuple[Params, int]:
     """Return parameters and renders of a fit by one of optax's optimizers."""
     renders = 0
@@ -149,41 +150,15 @@ def fit_with_gradients(
             mean_square(*small.shape[:2], level.samples, "camera" in params),
             params,
             args=(start, small, blur, moving(level), scale),
-            optimizer=optimizer(method, number, steps),
-            steps=steps,
+            optimizer=optimizer(method, number, level.steps),
+            steps=level.steps,
             callback=None if method == "adam" else Patience(),
         )
         params, renders = result.params, renders + result.renders
     return params, renders
 
 
-def fit_with(method: str) -> Callable[..., tuple[Params, int]]:
-    if method == "levenberg_marquardt":
-        return fit_with_lm
-    return functools.partial(fit_with_gradients, method)
-
-
 # Report -------------------------------------------------------------------------------------------
-
-
-def outcome(
-    method: str,
-    start: Start,
-    params: Params,
-    target: Array,
-    truth: View,
-    levels: list[Level],
-    steps: int,
-) -> dict[str, Any]:
-    """Fit from a start; returns errors, parameters, renders, seconds and whether it converged."""
-    before = time.perf_counter()
-    params, renders = fit_with(method)(start, target, params, levels, steps)
-    params = jax.device_get(params)
-    errors = view_errors(view_of(start, params), truth, float(start.size))
-    converged = all(errors[name] <= limit for name, limit in CRITERION.items())
-    seconds = time.perf_counter() - before
-    found = {"converged": converged, "renders": renders, "seconds": seconds, **errors}
-    return found | {"params": params}
 
 
 def run(
@@ -213,10 +188,10 @@ def run(
     asked = {"size": size, "degrees": degrees, "divisions": divisions, "steps": steps, "seed": seed}
     path = out / "fit_robustness.json"
     report: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"asked": asked}
-    if report["asked"] != asked:
-        raise ValueError(f"{path}: wanted a report of {asked}, got one of {report['asked']}")
+    check_same(path, "a report", asked, report["asked"])
     report |= {"criterion": CRITERION, "fits_at_once": at_once}
     levels = levels or levels_for(size)
+    gradient_levels = [level._replace(steps=steps) for level in levels]
 
     def begin(problem: str, number: int) -> View:
         generator = np.random.default_rng([seed, list(PROBLEMS).index(problem), number])
@@ -226,10 +201,25 @@ def run(
         view = begin(problem, number)
         start = start_of(mesh, view)
         params = start_parameters(view, **PROBLEMS[problem])
-        errors = view_errors(view, truth, float(start.size))
-        found = outcome(method, start, params, target, truth, levels, steps)
+        before = time.perf_counter()
+        if method == "levenberg_marquardt":
+            params, renders = fit_with_lm(start, target, params, levels)
+        else:
+            params, renders = fit_with_gradients(method, start, target, params, gradient_levels)
+        params = jax.device_get(params)
+        seconds = time.perf_counter() - before
+        at_start, errors = (
+            view_errors(found, truth, float(start.size)) for found in (view, view_of(start, params))
+        )
         told()
-        return {"at_start": errors, **found}
+        return {
+            "at_start": at_start,
+            "converged": all(errors[name] <= limit for name, limit in CRITERION.items()),
+            "renders": renders,
+            "seconds": seconds,
+            **errors,
+            "params": params,
+        }
 
     def left() -> Iterator[tuple[str, str, int]]:
         for problem in problems:
@@ -240,24 +230,21 @@ def run(
 
     with ThreadPoolExecutor(at_once) as pool:
         todo = list(left())
-        for (problem, method, _), row in zip(
-            todo, pool.map(one, *zip(*todo, strict=True)) if todo else (), strict=True
-        ):
+        rows = pool.map(lambda job: one(*job), todo)
+        for (problem, method, _), row in zip(todo, rows, strict=True):
             report["starts"][problem][method].append(row)
             save_json(path, report)
     report["found"] = {
-        problem: {
-            method: statistics(report["starts"][problem][method], CRITERION) for method in methods
-        }
-        for problem in problems
+        problem: {method: statistics(rows, CRITERION) for method, rows in found.items() if rows}
+        for problem, found in report["starts"].items()
     }
     save_json(path, report)
     plot_outcomes(out / "fit_robustness.png", report)
-    for method in methods:
+    for method in METHODS:
         failed = [
             (begin(problem, number), row)
-            for problem in problems
-            for number, row in enumerate(report["starts"][problem][method])
+            for problem, found in report["starts"].items()
+            for number, row in enumerate(found.get(method, []))
             if not row["converged"]
         ]
         plot_failures(out / f"failures_{method}.png", mesh, target, failed[:6])

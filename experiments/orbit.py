@@ -16,6 +16,7 @@ Expected: 36 views of the teapot at 256 x 256 in about 20 s, most of it compilat
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import load_mesh, progress_bar, save_json
+from common import check_same, load_mesh, progress_bar, save_json, save_whole
 from jax import Array
 
 import diffrast as dr
@@ -35,29 +36,36 @@ SUN = {"ambient": (0.15, 0.15, 0.15), "specular": (0.4, 0.4, 0.4)}
 FOLDERS = {"image": "images", "mask": "masks", "normal": "normals", "depth": "depth"}
 
 
-def orbit_cameras(mesh: dr.Mesh, views: int, elevation: float, rise: float) -> dr.Camera:
-    """Cameras round a mesh, z up, that see all of it.
+def orbit_cameras(
+    mesh: dr.Mesh,
+    views: int,
+    elevation: float,
+    rise: float = 0.0,
+    distance: float = 1.05 / math.sin(FIELD_OF_VIEW / 2),
+) -> dr.Camera:
+    """Cameras round a mesh, z up, that look at its middle.
 
     Args:
         mesh: what is seen.
         views: how many.
         elevation: angle above the horizon of the first view, in radians.
         rise: by how much the last one is higher.
+        distance: of the eye, in half diagonals of the box round the mesh; by default all is seen.
     """
     low, high = jnp.min(mesh.vertices, axis=0), jnp.max(mesh.vertices, axis=0)
     centre, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
-    distance = 1.05 * radius / np.sin(FIELD_OF_VIEW / 2)
+    away = distance * radius
 
     def camera(part: Array) -> dr.Camera:
         around, above = 2 * jnp.pi * part, elevation + rise * part
         way = [jnp.cos(around) * jnp.cos(above), jnp.sin(around) * jnp.cos(above), jnp.sin(above)]
         return dr.Camera.perspective(
-            eye=centre + distance * jnp.stack(way),
+            eye=centre + away * jnp.stack(way),
             target=centre,
             up=(0, 0, 1),
             fov_y=FIELD_OF_VIEW,
-            near=distance / 50,
-            far=distance * 2.5,
+            near=away / 50,
+            far=away * 2.5,
         )
 
     return jax.vmap(camera)(jnp.arange(views) / views)
@@ -83,9 +91,10 @@ def save_view(folder: Path, number: int, view: dict[str, np.ndarray]) -> None:
     encoded = np.repeat(view["mask"][..., None].astype(np.float32), 3, axis=-1)
     dr.save_image(folder / "masks" / f"{number:04}.png", encoded, srgb=False)
     dr.save_image(folder / "normals" / f"{number:04}.png", view["normal"], srgb=False)
-    unfinished = folder / "images" / f"unfinished-{number:04}.png"
-    dr.save_image(unfinished, view["image"])
-    unfinished.replace(folder / "images" / f"{number:04}.png")
+    save_whole(
+        folder / "images" / f"{number:04}.png",
+        lambda unfinished: dr.save_image(unfinished, view["image"]),
+    )
 
 
 def save_cameras(folder: Path, cameras: dr.Camera, views: int, size: int) -> None:
@@ -146,8 +155,9 @@ def run(
     asked = {"views": views, "size": size, "elevation": elevation, "rise": rise}
     asked |= {"vertices": mesh.vertices.shape[0], "faces": mesh.faces.shape[0]}
     settings_file = out / "orbit.json"
-    if settings_file.exists() and json.loads(settings_file.read_text())["asked"] != asked:
-        raise ValueError(f"{out}: wanted an empty folder or views of {asked}, got others")
+    if settings_file.exists():
+        before = json.loads(settings_file.read_text())["asked"]
+        check_same(settings_file, "a turntable", asked, before)
     save_json(settings_file, {"asked": asked})
 
     cameras = orbit_cameras(mesh, views, elevation, rise)

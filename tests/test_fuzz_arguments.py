@@ -44,8 +44,8 @@ class Reached(Exception):  # noqa: N818 (no error: the arguments passed)
 
 LARGE = (
     "diffrast.render.world_geometry",
-    "diffrast.views._in_order",
-    "diffrast.views._usual_chunk",
+    "diffrast.views.in_order",
+    "diffrast.views.usual_chunk",
     "diffrast.raster.fragments.stored_rows",
     "diffrast.interpolate.interpolate_columns",
     "diffrast.interpolate.face_slopes",

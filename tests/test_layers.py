@@ -95,6 +95,7 @@ ORDER = [
     "diffrast.deferred",
     "diffrast.render",
     "diffrast.recolor",
+    "diffrast._chunks",
     "diffrast.views",
     "diffrast.scene_files",
     "diffrast._fit_result",

@@ -21,7 +21,7 @@ def test_a_turntable_is_written_and_goes_on_where_it_stopped(tmp_path):
     assert seen == [1]
     assert (tmp_path / "orbit.gif").is_file()
     assert dr.load_image(tmp_path / "sheet.png").shape == (48, 48, 3)
-    with pytest.raises(ValueError, match="wanted an empty folder or views of"):
+    with pytest.raises(ValueError, match="wanted a turntable of"):
         orbit.run(mesh, tmp_path, **{**SMALL, "views": 4})
 
     # Both descriptions of a camera bring the visible points to their pixels.

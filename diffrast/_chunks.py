@@ -1,0 +1,201 @@
+"""Work on views in chunks: a compiled loop draws some of them, and several such loops run at once.
+
+A chunk has room for a fixed number of views, so that one program serves any number of them; where
+fewer are left the last one fills the room and is not drawn.
+"""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import Mesh as DeviceMesh
+from jax.sharding import NamedSharding, PartitionSpec
+
+from diffrast._stored import stored
+
+AXIS = "views"
+LEAST = 2  # of one view XLA would compile other arithmetic
+_CHUNK = 16
+_CHUNK_BYTES = 1 << 24
+
+ViewFunction = Callable[[Any, Any], Any]
+Kinds = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of arrays
+
+
+def one_of(views: Any) -> Any:
+    """The shape of one view."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x)[1:], jnp.result_type(x)), views)
+
+
+def usual_chunk(function: ViewFunction, views: Any, shared: Any) -> int:
+    """How many views a chunk holds if nobody says."""
+    leaves, structure = jax.tree.flatten((shared, views))
+    kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
+    return _room(function, structure, kinds)
+
+
+@lru_cache(maxsize=64)
+def _room(function: ViewFunction, structure: Any, kinds: Kinds) -> int:
+    """How many views fit into a chunk, with what is drawn of them."""
+    shared, views = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*kind) for kind in kinds])
+    view = one_of(views)
+    leaves = jax.tree.leaves((view, jax.eval_shape(function, shared, view)))
+    size = sum(x.size * x.dtype.itemsize for x in leaves)
+    return int(np.clip(_CHUNK_BYTES // max(size, 1), 1, _CHUNK))
+
+
+def kept(result: Any) -> Any:
+    """Stores what a function returns, which would else be computed where it is put into place.
+
+    That is one loop on one core, in which nothing is computed once for several values.
+    """
+
+    def keep(x: Any) -> Any:
+        return stored(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x
+
+    return jax.tree.map(keep, result)
+
+
+def device_mesh(devices: tuple[jax.Device, ...]) -> DeviceMesh:
+    return DeviceMesh(np.array(devices), (AXIS,))
+
+
+def some_views(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
+    """Results of the first `number` of some views; zeros for the others."""
+    one = jax.eval_shape(function, shared, one_of(views))
+    size = jax.tree.leaves(views)[0].shape[0]
+
+    def step(i: Array, results: Any) -> Any:
+        result = kept(function(shared, jax.tree.map(lambda x: x[i], views)))
+        return jax.tree.map(lambda row, x: row.at[i].set(x), results, result)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), one)
+    return lax.fori_loop(0, number, step, nothing)
+
+
+def block_sum(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
+    """Sum of results of the first `number` of some views, with a leading axis of one."""
+    one = jax.eval_shape(function, shared, one_of(views))
+
+    def step(i: Array, total: Any) -> Any:
+        result = kept(function(shared, jax.tree.map(lambda x: x[i], views)))
+        return jax.tree.map(lambda all_, x: all_ + x[None], total, result)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), one)
+    return lax.fori_loop(0, number, step, nothing)
+
+
+@lru_cache(maxsize=64)
+def _program(
+    work: Callable[..., Any],
+    function: ViewFunction,
+    structure: Any,
+    kinds: Kinds,
+    devices: tuple[jax.Device, ...],
+    number: np.dtype,
+) -> Callable[..., Any]:
+    """The compiled loop over a chunk of views; `number` is the kind of numbers in use."""
+    del number
+    split = PartitionSpec(AXIS)
+
+    def on_each(shared: Any, views: Any, number: Array) -> Any:
+        size = jax.tree.leaves(views)[0].shape[0]
+        before = lax.axis_index(AXIS) * size
+        return work(function, shared, views, jnp.clip(number - before, 0, size))
+
+    def alone(shared: Any, views: Any, number: Array) -> Any:
+        return work(function, shared, views, number)
+
+    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    shared, views = jax.tree.unflatten(structure, leaves)
+    count = jax.ShapeDtypeStruct((), np.int32)
+    if not devices:
+        return jax.jit(alone).lower(shared, views, count).compile()
+    mesh = device_mesh(devices)
+    everywhere, sharded = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), split))
+    # Every device works for itself: what a function does with `shared`, its derivative too, stays
+    # on the device.
+    on_all = jax.shard_map(
+        on_each,
+        mesh=mesh,
+        in_specs=(PartitionSpec(), split, PartitionSpec()),
+        out_specs=split,
+        check_vma=False,
+    )
+    jitted = jax.jit(on_all, in_shardings=(everywhere, sharded, everywhere), out_shardings=sharded)
+    return jitted.lower(shared, views, count).compile()
+
+
+def in_order(
+    work: Callable[..., Any],
+    function: ViewFunction,
+    views: Any,
+    shared: Any,
+    size: int,
+    each: int,
+    devices: tuple[jax.Device, ...],
+) -> Iterator[tuple[int, Any]]:
+    """Pairs (first view, result of `work`) of `each` views, in rooms of `size` for each device."""
+    views = jax.tree.map(np.asarray, views)
+    shared = jax.tree.map(_as_array, shared)
+    count, rows_at_once = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
+
+    def chunk(first: int) -> Any:
+        def rows(x: np.ndarray) -> np.ndarray:
+            part = x[first : min(first + each, count)]
+            return np.concatenate([part, np.repeat(part[-1:], rows_at_once - len(part), axis=0)])
+
+        return jax.tree.map(rows, views)
+
+    leaves, structure = jax.tree.flatten((shared, chunk(0)))
+    kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    program = _program(work, function, structure, kinds, devices, jnp.result_type(float))
+
+    def draw(first: int) -> Any:
+        result = program(shared, chunk(first), np.int32(min(each, count - first)))
+        return jax.tree.map(_on_host, jax.block_until_ready(result))
+
+    if count <= each:
+        yield 0, draw(0)
+        return
+    workers = 1 if devices else cores()
+    waiting: deque[tuple[int, Future[Any]]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for first in range(0, count, each):
+            waiting.append((first, pool.submit(draw, first)))
+            if len(waiting) > workers:
+                number, result = waiting.popleft()
+                yield number, result.result()
+        for number, result in waiting:
+            yield number, result.result()
+
+
+def _as_array(x: Any) -> Array:
+    """With a type of its own, not that of a number in the code."""
+    known = isinstance(x, Array) and not x.weak_type
+    return x if known else jnp.asarray(x, jnp.result_type(x))
+
+
+def _on_host(x: Array) -> Any:
+    """As numpy has it, unless other processes hold a part of it."""
+    return np.asarray(x) if x.is_fully_addressable else x
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    if len(parts) == 1:
+        return parts[0]
+    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
+
+
+def cores() -> int:
+    """Cores that this process may use, 1 where another device draws."""
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
