@@ -7,12 +7,14 @@ until none is left. Most images have few chosen pixels, so blocks without any ar
 from collections.abc import Callable
 from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
 from diffrast._stored import stored
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 _BLOCK = 16
@@ -90,3 +92,38 @@ def over_batches(
         return add(stored(order[jnp.minimum(slots, order.shape[0] - 1)]), slots < count, total)
 
     return lax.fori_loop(0, (count + at_once - 1) // at_once, step, start)
+
+
+def work_off(
+    count: Int[Array, ""],
+    at_once: int,
+    begin: Callable[[Int[Array, " some"]], S],
+    step: Callable[[S, Bool[Array, " some"], T], tuple[S, Bool[Array, " some"], T]],
+    start: T,
+) -> T:
+    """Work through `count` pieces of work that take unequal numbers of steps, so many at a time.
+
+    A piece that has ended makes room for the next at once.
+
+    Args:
+        count: of pieces.
+        at_once: pieces side by side.
+        begin: makes what is known of pieces at first of their numbers.
+        step: takes what is known of pieces, which of them go on, and the total; returns the same.
+        start: the total before.
+    """
+
+    def advance(state: tuple[Array, Array, S, T]) -> tuple[Array, Array, S, T]:
+        following, goes, known, total = state
+        rank = stored(prefix_sum((~goes).astype(jnp.int32)))
+        number = following + rank - 1
+        fresh = stored(~goes & (number < count))
+        known = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begin(number), known)
+        known, goes, total = step(stored(known), goes | fresh, total)
+        return following + rank[-1], goes, stored(known), total
+
+    def is_left(state: tuple[Array, Array, S, T]) -> Array:
+        return (state[0] < count) | jnp.any(state[1])
+
+    none = jnp.zeros(at_once, jnp.int32) + (count & 0)
+    return lax.while_loop(is_left, advance, (count & 0, none < 0, begin(none), start))[-1]

@@ -2,19 +2,20 @@
 
 Most points are told by one texel of the light's picture (see `maps`). The others, at the outlines
 of shadows and where the picture is too coarse for the surface, are collected and looked at one by
-one: the faces at the 3×3 texels round such a point, and those to which walks over the surface lead
-from them towards the point, are cut with its ray to the light. So outlines are exact at any
-resolution, also where faces at the rim are thinner than a texel, but for surfaces of which none of
-the nine texels shows anything.
+one. If one of the 3×3 texels round such a point shows anything before the plane of the point's
+face, its ray to the light is cut with the faces there, and with those to which ways over the
+surface lead from them towards the ray. So outlines are exact at any resolution, also where faces at
+the rim are thinner than a texel, but for surfaces of which none of the nine texels shows anything.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._selection import over_batches, prefix_sum, selected
+from diffrast._selection import compacted, over_batches, selected, work_off
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
@@ -23,29 +24,40 @@ from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import (
     ROUNDINGS,
     Line,
-    Nearby,
     Rays,
     Texel,
     cut_by,
     face_corners,
-    faces_near,
+    line_of,
     texel_of,
+    texels_round,
 )
 
-_AT_ONCE = 1024
+T = TypeVar("T")
+
+_AT_ONCE = 4096
 _WAYS_AT_ONCE = 256
 _STEPS = 64  # from face to face
+_LOST, _HIDDEN = 1, 2  # fates
 _SMALL = 4.0  # square texels, twice the area of a face
 
 
-class _Ways(NamedTuple):
+class _Sight(NamedTuple):
+    """What is known of rays from the keys alone."""
+
+    line: Line
+    slopes: Float[Array, "2 n"]  # of the keys on the faces on which they begin
+    before: Float[Array, "9 n"]  # by how much the nine texels show more than the faces' planes
+
+
+class _Way(NamedTuple):
     """Ways over the surface."""
 
+    ray: Int[Array, " n"]
     face: Int[Array, " n"]
-    turn: Float[Array, " n"]  # of the face before
-    goes: Bool[Array, " n"]
-    stops: Bool[Array, " n"]  # whether a face at the end stops the ray
-    lost: Bool[Array, " n"]  # at the border of the surface
+    turn: Float[Array, " n"]  # of the face before; 0 at first
+    steps: Int[Array, " n"]
+    central: Bool[Array, " n"]  # whether they come from the nearest texel
 
 
 def lit(
@@ -55,16 +67,22 @@ def lit(
     texel = texel_of(pictures, rays)
     key, slope_x, slope_y, error = _at_texels(pictures.texel, rays.picture, texel).T
     depth = key + slope_x * texel.x + slope_y * texel.y
-    rounding = ROUNDINGS * jnp.finfo(key.dtype).eps * rays.unit
-    bright = rays.asked & (rays.key >= depth - error - rounding)
+    bright = rays.asked & (rays.key >= depth - error - _rounding(rays))
     order, count = selected(rays.asked & jnp.isinf(error))
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
-        some = stored(Rays(*(column[..., chosen] for column in rays)))
-        place = jnp.where(exists, chosen, bright.size)
-        return bright.at[place].set(~_blocked(pictures, geometry, neighbors, some), mode="drop")
+        some = _entries(rays, chosen)
+        sight = stored(_sight(pictures, geometry, some))
+        doubt = exists & jnp.any(sight.before > 0, axis=0)
+        hidden = _hidden(pictures, geometry, neighbors, some, sight, doubt)
+        return bright.at[jnp.where(hidden, chosen, bright.size)].set(False, mode="drop")
 
     return over_batches(order, count, _AT_ONCE, look_closer, bright).astype(key.dtype)
+
+
+def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
+    """Some entries of arrays, along their last axis."""
+    return stored(jax.tree.map(lambda column: column[..., chosen], columns))
 
 
 def _at_texels(values: Array, picture: Array, texel: Texel) -> Array:
@@ -74,78 +92,71 @@ def _at_texels(values: Array, picture: Array, texel: Texel) -> Array:
     return values.reshape(-1, *values.shape[3:])[stored(number)]
 
 
-def _blocked(
-    pictures: Pictures, geometry: Geometry, neighbors: Int[Array, "F 3"], rays: Rays
-) -> Bool[Array, " n"]:
-    """Whether faces near the rays from points to the light stop them."""
-    nearby = faces_near(pictures, geometry, rays)
+def _rounding(rays: Rays) -> Array:
+    return ROUNDINGS * jnp.finfo(rays.unit.dtype).eps * rays.unit
+
+
+def _sight(pictures: Pictures, geometry: Geometry, rays: Rays) -> _Sight:
+    own = face_corners(geometry, rays.face)
     texel, nine = texel_of(pictures, rays), jnp.arange(9)[:, None]
-    slopes, _ = _slopes(pictures, rays, nearby.own)
+    key = pictures.texel[rays.picture, *texels_round(pictures, texel), 0]
+    slopes, _ = _slopes(pictures, rays, own)
     along_row = slopes[0] * (texel.x - (nine % 3 - 1))
     along_column = slopes[1] * (texel.y - (nine // 3 - 1))
-    before = stored((nearby.key - rays.key) + along_row + along_column)
-    hidden, unknown = _walk(geometry, neighbors, rays.face, nearby, before > 0)
-    return hidden | (unknown & _hidden_by_small(pictures, rays, nearby, slopes, before[4]))
+    before = (key - rays.key) + along_row + along_column - _rounding(rays)
+    return _Sight(line_of(pictures, rays, own), jnp.stack(slopes), before)
 
 
-def _walk(
+def _hidden(
+    pictures: Pictures,
     geometry: Geometry,
     neighbors: Int[Array, "F 3"],
-    own: Int[Array, " n"],
-    nearby: Nearby,
-    before: Bool[Array, "9 n"],
-) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Whether the faces near rays, or those to which ways over the surface lead, stop them.
+    rays: Rays,
+    sight: _Sight,
+    doubt: Bool[Array, " n"],
+) -> Bool[Array, " n"]:
+    """Which of the doubtful rays are stopped by faces near them.
 
-    Ways go from what the texels show before the plane of the ray's own face, each time across the
-    edge beyond which the ray lies farthest; they end where the surface does, or turns away. Also
-    returns whether the way from the nearest texel came to the surface's border, or to no end: then
-    one cannot know what is beyond.
+    Ways over the surface begin at the face that the nearest texel shows, then, for rays that are
+    not stopped yet, at those that the others show before the plane of the ray's own face. They lead
+    each time across the edge beyond which the ray lies farthest, and end at a face that it passes,
+    where the surface ends, or where it turns away. Of a ray that is lost, at the surface's border
+    or on an endless way from the nearest texel, one cannot know what is beyond.
     """
-    n = own.size
-    hidden = jnp.any(nearby.cut.stops > 0, axis=0)
-    ahead = jnp.where(nearby.face >= 0, _across(neighbors, nearby.face, nearby.cut.corner), -1)
-    unknown = (nearby.face[4] >= 0) & (nearby.cut.corner[4] < 3) & (ahead[4] < 0)
-    goes = before & (ahead >= 0) & (ahead != own) & ~hidden & (nearby.cut.turn != 0)
-    nine = jnp.arange(9)[:, None]
-    rank = jnp.where(nine == 4, -1, nine)
-    told = before | (nearby.cut.corner == 3)
-    for i in range(9):
-        again = (ahead == nearby.face[i]) & told[i]
-        again = again | ((ahead == ahead[i]) & before[i] & (rank > rank[i]))
-        goes = goes & ~(again & (nine != 4))
-    number = stored(prefix_sum(jnp.ravel(goes).astype(jnp.int32)))
-    ahead, turn = stored((jnp.ravel(ahead), jnp.ravel(nearby.cut.turn)))
+    count, nine = doubt.size, jnp.arange(9)[:, None]
 
-    def walk(slot: Array, exists: Array, known: tuple[Array, Array]) -> tuple[Array, Array]:
-        way = stored(jnp.searchsorted(number, slot + 1, method="scan_unrolled"))
-        way = jnp.minimum(way, 9 * n - 1)
-        ray = stored(way % n)
-        line = stored(Line(*(column[..., ray] for column in nearby.line)))
-        end = own[ray]
+    def begin(way: Array) -> _Way:
+        ray, texel = way % count, way // count
+        place = texels_round(pictures, texel_of(pictures, _entries(rays, ray)), texel)
+        face = pictures.face[rays.picture[ray], *place]
+        return _Way(ray, face, jnp.zeros_like(rays.key[ray]), jnp.zeros_like(way), texel == 4)
 
-        def step(state: tuple[Array, _Ways]) -> tuple[Array, _Ways]:
-            steps, ways = state
-            cut = cut_by(line, face_corners(geometry, ways.face))
-            on = ways.goes & (cut.turn * ways.turn > 0)
-            stops = on & (cut.corner == 3) & (cut.stops > 0)
-            on = on & (cut.corner < 3)
-            ahead = _across(neighbors, ways.face, cut.corner)
-            lost = ways.lost | (on & (ahead < 0))
-            on = on & (ahead >= 0) & (ahead != end)
-            return steps + 1, stored(_Ways(ahead, cut.turn, on, ways.stops | stops, lost))
+    def walk(way: _Way, goes: Array, fate: Array) -> tuple[_Way, Array, Array]:
+        own = rays.face[way.ray]
+        passed = cut_by(_entries(sight.line, way.ray), face_corners(geometry, way.face))
+        same = jnp.where(way.steps > 0, passed.turn * way.turn > 0, passed.turn != 0)
+        on = goes & same & (way.face != own) & (way.face >= 0)
+        stops = on & (passed.corner == 3) & (passed.stops > 0)
+        on = on & (passed.corner < 3)
+        ahead = _across(neighbors, way.face, passed.corner)
+        lost = on & way.central & ((ahead < 0) | (way.steps == _STEPS))
+        on = on & (ahead >= 0) & (way.steps < _STEPS)
+        fate = fate.at[way.ray].max(jnp.where(stops, _HIDDEN, jnp.where(lost, _LOST, 0)))
+        return _Way(way.ray, ahead, passed.turn, way.steps + 1, way.central), on, fate
 
-        def is_on_the_way(state: tuple[Array, _Ways]) -> Array:
-            return (state[0] < _STEPS) & jnp.any(state[1].goes)
+    def follow(turn: Array, fate: Array) -> Array:
+        others = (nine != 4) & (sight.before > 0) & (fate < _HIDDEN)
+        ways, size = selected(jnp.ravel(doubt & jnp.where(turn == 0, nine == 4, others)))
+        return work_off(size, _WAYS_AT_ONCE, lambda slot: begin(ways[slot]), walk, fate)
 
-        start = _Ways(ahead[way], turn[way], exists, exists & False, exists & False)
-        _, ways = lax.while_loop(is_on_the_way, step, (jnp.sum(way) & 0, stored(start)))
-        hidden, unknown = known
-        lost = (ways.lost | ways.goes) & (way // n == 4)
-        return hidden.at[ray].max(ways.stops), unknown.at[ray].max(lost)
+    fate = lax.fori_loop(0, 2, follow, (doubt & False).astype(jnp.int32))
+    order, size = compacted(fate == _LOST, jnp.arange(count, dtype=jnp.int32))
 
-    slots = jnp.arange(-(-9 * n // _WAYS_AT_ONCE) * _WAYS_AT_ONCE, dtype=jnp.int32)
-    return over_batches(slots, number[-1], _WAYS_AT_ONCE, walk, (hidden, unknown))
+    def guess(ray: Array, exists: Array, hidden: Array) -> Array:
+        some = _is_hidden_by_small(pictures, geometry, _entries(rays, ray), _entries(sight, ray))
+        return hidden.at[ray].max(some & exists)
+
+    return over_batches(order, size, _WAYS_AT_ONCE, guess, fate == _HIDDEN)
 
 
 def _across(
@@ -156,26 +167,21 @@ def _across(
     return jnp.where(corner < 3, beside, -1)
 
 
-def _hidden_by_small(
-    pictures: Pictures,
-    rays: Rays,
-    nearby: Nearby,
-    own_slopes: list[Array],
-    before: Float[Array, " n"],
+def _is_hidden_by_small(
+    pictures: Pictures, geometry: Geometry, rays: Rays, sight: _Sight
 ) -> Bool[Array, " n"]:
     """Whether points lie behind the nearest texel, of faces too small for a texel each.
 
     What is compared are the planes of the point's own face and of the nearest texel's, with a
     margin for surfaces that curve from one to the other.
     """
-    slopes, area = _slopes(pictures, rays, nearby.corners[:, :, 4])
     texel = texel_of(pictures, rays)
-    margin = jnp.abs((slopes[0] - own_slopes[0]) * texel.x)
-    margin = margin + jnp.abs((slopes[1] - own_slopes[1]) * texel.y)
-    margin = margin + ROUNDINGS * jnp.finfo(margin.dtype).eps * rays.unit
-    face = nearby.face[4]
-    shown = jnp.any(nearby.face == rays.face, axis=0)
-    hidden = (face >= 0) & (face != rays.face) & (before > margin)
+    faces = pictures.face[rays.picture, *texels_round(pictures, texel)]
+    slopes, area = _slopes(pictures, rays, face_corners(geometry, faces[4]))
+    margin = jnp.abs((slopes[0] - sight.slopes[0]) * texel.x)
+    margin = margin + jnp.abs((slopes[1] - sight.slopes[1]) * texel.y)
+    shown = jnp.any(faces == rays.face, axis=0)
+    hidden = (faces[4] >= 0) & (faces[4] != rays.face) & (sight.before[4] > margin)
     return hidden & ((area < _SMALL) | ~shown)
 
 

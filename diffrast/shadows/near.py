@@ -56,9 +56,7 @@ class Nearby(NamedTuple):
     face: Int[Array, "9 n"]
     key: Float[Array, "9 n"]
     corners: Float[Array, "3 3 9 n"]
-    own: Float[Array, "3 3 n"]  # of the face on which the ray begins
     cut: Cut
-    line: Line
 
 
 class Texel(NamedTuple):
@@ -77,27 +75,36 @@ def texel_of(pictures: Pictures, rays: Rays) -> Texel:
     return Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
 
 
-def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays) -> Nearby:
-    """The faces at the 3×3 texels round rays, and which of them stop these."""
-    texel = texel_of(pictures, rays)
+def texels_round(
+    pictures: Pictures, texel: Texel, which: Int[Array, "*n"] | None = None
+) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]:
+    """Rows and columns of the 3×3 texels round some, or of one of these nine by its number."""
     last = pictures.face.shape[1] - 1
-    nine = jnp.arange(9)[:, None]
-    row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
-    column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
-    around = stored(pictures.face[rays.picture, row, column])
-    own, others = face_corners(geometry, rays.face), face_corners(geometry, around)
+    which = jnp.arange(9)[:, None] if which is None else which
+    row = jnp.clip(texel.row + which // 3 - 1, 0, last)
+    return row, jnp.clip(texel.column + which % 3 - 1, 0, last)
+
+
+def line_of(pictures: Pictures, rays: Rays, own: Float[Array, "3 3 n"]) -> Line:
+    """Rays and where they begin, on faces with these corners."""
     origin = own[:, 0]
     total = jnp.sum(rays.barycentrics, axis=0)
     shares = rays.barycentrics / jnp.where(total == 0, 1, total)
     point = shares[1] * (own[:, 1] - origin) + shares[2] * (own[:, 2] - origin)
     source = pictures.plan.source[rays.picture].T
     ray = (source[:3] - source[3] * origin) - source[3] * point
-    line = stored(Line(origin, point, ray, source[3] == 0))
+    return Line(origin, point, ray, source[3] == 0)
+
+
+def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays, line: Line) -> Nearby:
+    """The faces at the 3×3 texels round rays, and which of them stop these."""
+    texels = rays.picture, *texels_round(pictures, texel_of(pictures, rays))
+    around = stored(pictures.face[texels])
+    others = face_corners(geometry, around)
     cut = cut_by(Line(*(column[..., None, :] for column in line)), others)
     foreign = (around >= 0) & (around != rays.face)
     cut = cut._replace(stops=jnp.where(foreign, cut.stops, -1))
-    key = pictures.texel[rays.picture, row, column, 0]
-    return Nearby(around, key, others, own, cut, line)
+    return Nearby(around, pictures.texel[*texels, 0], others, cut)
 
 
 def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:

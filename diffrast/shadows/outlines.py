@@ -25,7 +25,7 @@ from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution
 from diffrast.shadows.maps import Pictures
-from diffrast.shadows.near import Rays, face_corners, faces_near, seen_by_light
+from diffrast.shadows.near import Rays, face_corners, faces_near, line_of, seen_by_light
 from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
@@ -182,7 +182,8 @@ def _edge_between(
         unit=zero,
         asked=zero == 0,
     )
-    nearby = faces_near(pictures, geometry, rays)
+    line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
+    nearby = faces_near(pictures, geometry, rays, line)
     part, _, _ = _leaves(stored(seen(nearby.corners)), ends)
     part = stored(jnp.where((nearby.cut.stops > 0) & (part < 2), part, -1))
     farthest = jnp.max(part, axis=0)
