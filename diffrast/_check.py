@@ -24,6 +24,12 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
+def strongly_typed(value: Any) -> Array:
+    """With a type of its own, not that of a number in the code, for which JAX compiles anew."""
+    known = isinstance(value, Array) and not value.weak_type
+    return value if known else jnp.asarray(value, jnp.result_type(value))
+
+
 def float_array(
     name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, finite: bool = True
 ) -> Array:

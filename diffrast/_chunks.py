@@ -18,6 +18,7 @@ from jax import Array, lax
 from jax.sharding import Mesh as DeviceMesh
 from jax.sharding import NamedSharding, PartitionSpec
 
+from diffrast._check import strongly_typed
 from diffrast._stored import stored
 
 AXIS = "views"
@@ -144,7 +145,7 @@ def in_order(
 ) -> Iterator[tuple[int, Any]]:
     """Pairs (first view, result of `work`) of `each` views, in rooms of `size` for each device."""
     views = jax.tree.map(np.asarray, views)
-    shared = jax.tree.map(_as_array, shared)
+    shared = jax.tree.map(strongly_typed, shared)
     count, rows_at_once = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
 
     def chunk(first: int) -> Any:
@@ -175,12 +176,6 @@ def in_order(
                 yield number, result.result()
         for number, result in waiting:
             yield number, result.result()
-
-
-def _as_array(x: Any) -> Array:
-    """With a type of its own, not that of a number in the code."""
-    known = isinstance(x, Array) and not x.weak_type
-    return x if known else jnp.asarray(x, jnp.result_type(x))
 
 
 def _on_host(x: Array) -> Any:

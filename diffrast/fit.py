@@ -43,6 +43,7 @@ from diffrast._check import (
     one_of,
     positive_int,
     real_number,
+    strongly_typed,
 )
 from diffrast._fit_result import Callback as Callback
 from diffrast._fit_result import FitResult as FitResult
@@ -98,7 +99,7 @@ def minimize(
     optimizer = _default_optimizer(steps) if optimizer is None else optimizer
     instance_of("optimizer", optimizer, optax.GradientTransformation)
 
-    state = optimizer.init(params)
+    state = jax.tree.map(strongly_typed, optimizer.init(params))
     best, converged, reason = params, False, f"all {steps} steps taken"
     renders = 0
     with Log(steps, record_params, progress, callback) as log:

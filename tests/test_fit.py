@@ -240,6 +240,22 @@ def test_minimize_with_adam_and_lbfgs():
     np.testing.assert_allclose(newton.params["x"], 1, atol=1e-3)
 
 
+def test_a_line_search_is_compiled_once():
+    traced, after_steps = [], []
+
+    def loss(params):
+        traced.append(params)
+        return jnp.sum((params - 1) ** 4)
+
+    def count(*_):
+        after_steps.append(len(traced))
+        return False
+
+    fit.minimize(loss, jnp.zeros(3), optimizer=optax.lbfgs(), steps=3, callback=count)
+    assert len(after_steps) == 4
+    assert after_steps[0] == after_steps[-1]
+
+
 def test_minimize_stops():
     quadratic = functools.partial(lambda centre, x: (x - centre) ** 2 + 1.0, 0.3)
     sgd = optax.sgd(0.4)
