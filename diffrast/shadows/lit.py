@@ -69,6 +69,7 @@ def lit(
     depth = key + slope_x * texel.x + slope_y * texel.y
     bright = rays.asked & (rays.key >= depth - error - _rounding(rays))
     order, count = selected(rays.asked & jnp.isinf(error))
+    at_once = min(_AT_ONCE, 512 * -(-rays.x.size // 4096))  # some of few, as edges have
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
         some = _entries(rays, chosen)
@@ -77,7 +78,7 @@ def lit(
         hidden = _hidden(pictures, geometry, neighbors, some, sight, doubt)
         return bright.at[jnp.where(hidden, chosen, bright.size)].set(False, mode="drop")
 
-    return over_batches(order, count, _AT_ONCE, look_closer, bright).astype(key.dtype)
+    return over_batches(order, count, at_once, look_closer, bright).astype(key.dtype)
 
 
 def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
