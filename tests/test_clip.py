@@ -10,6 +10,8 @@ import diffrast as dr
 from diffrast import mesh as dm
 from diffrast.clip import FRUSTUM, clip_lines, clip_mesh, clip_triangles
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def area(points):
     x, y = np.asarray(points, np.float64).T

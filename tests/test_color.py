@@ -18,6 +18,8 @@ from diffrast.color import (
     srgb_to_linear,
 )
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def test_numbers_of_the_standard():
     encoded = np.array([0.0, 0.02, 0.5, 188 / 255, 1.0])

@@ -12,6 +12,8 @@ from diffrast.camera import world_to_clip
 from diffrast.raster import rasterize
 from diffrast.raster.evaluate import Drawn, all_pixels, evaluate
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 SIZE = 16
 RNG = np.random.default_rng(0)
 

@@ -22,6 +22,8 @@ from diffrast.light import (
 from diffrast.material import Material
 from diffrast.shade import Reflectance, Surface, needs, phong
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 AMBIENT = {"color": (0.2, 0.1, 0.3)}
 DIRECTIONAL = {
     "direction": (0.4, -1.3, -2.0),

@@ -40,6 +40,14 @@ def test_views_are_those_of_single_calls(singles, options):
     np.testing.assert_array_equal(dr.render_views(scene(), CAMERAS, SETTINGS, **options), singles)
 
 
+def test_vmap_under_map_gives_single_images(singles):
+    def image(turn):
+        return dr.render(scene(), camera(turn), SETTINGS)
+
+    images = jax.jit(lambda turns: jax.lax.map(jax.vmap(image), turns))(TURNS[:4].reshape(2, 2))
+    np.testing.assert_array_equal(images.reshape(singles[:4].shape), singles[:4])
+
+
 def test_they_come_in_order_a_chunk_at_a_time(singles):
     seen = []
     stream = views.stream_views(views.image_of, CAMERAS, (scene(), SETTINGS), chunk=4)
