@@ -416,6 +416,7 @@ def test_a_gradient_in_lights_only_has_no_part_for_the_geometry():
     assert to_vertices[1] > 0
 
 
+@pytest.mark.default_compilation
 def test_stored_values_and_their_derivatives_are_unchanged():
     values = jnp.array(np.random.default_rng(0).normal(size=(50, 3)))
     special = jnp.array([0.0, -0.0, jnp.inf, -jnp.inf, jnp.nan, 1e-45, -3e38])

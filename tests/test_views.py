@@ -12,6 +12,8 @@ import pytest
 import diffrast as dr
 from diffrast import shapes, views
 
+pytestmark = pytest.mark.default_compilation
+
 SETTINGS = dr.RenderSettings(height=12, width=16, antialias=False)
 MESH = shapes.icosphere(1)
 TURNS = np.linspace(0, 6, 5).astype(np.float32)
