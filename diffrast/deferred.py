@@ -1,9 +1,10 @@
 """Shading the pixels that see something.
 
-A picture alone is shaded in one go. With its derivative there are hundreds of values for each pixel
-between faces and colours, more than memory can pass along in good time: so the image is cut into
-runs of pixels, runs without a face are left out, and the others are shaded in batches that stay in
-cache. A reverse pass goes through the batches again and begins by repeating each.
+A picture alone is shaded in one go, a large one only if it shows a face. With its derivative there
+are hundreds of values for each pixel between faces and colours, more than memory can pass along in
+good time: so the image is cut into runs of pixels, runs without a face are left out, and the others
+are shaded in batches that stay in cache. A reverse pass goes through the batches again and begins
+by repeating each.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Int
 
 from diffrast._selection import compacted
-from diffrast._varying import varying_alike
+from diffrast._varying import varying_alike, varying_zero
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, all_pixels, carry, pixels_at
@@ -42,6 +43,7 @@ class _Inputs(NamedTuple):
     drawn: Drawn
     face: Int[Array, "height width"]
     reached: Reached
+    background: Columns
 
 
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
@@ -53,10 +55,11 @@ def shade_covered(
     drawn: Drawn,
     face: Int[Array, "height width"],
     reached: Reached,
+    background: Columns,
     *,
     in_batches: bool,
 ) -> Columns:
-    """Colours of the pixels that see a face, in whole images; of no meaning elsewhere.
+    """Colours of the pixels that see a face and of those that see the background, in whole images.
 
     Args:
         shade: colours of points, one array a channel; its first argument is `data`.
@@ -65,15 +68,21 @@ def shade_covered(
         drawn: what is drawn.
         face: that each pixel sees, -1 for none.
         reached: by each light; images.
+        background: numbers or images.
         in_batches: whether derivatives of large images are.
     """
-    inputs = _Inputs(data, drawn, face, reached)
+    inputs = _Inputs(data, drawn, face, reached, background)
     if not in_batches or face.size <= LARGE:
         return _in_one_go(shade, inputs)
 
     @jax.custom_jvp
     def colors(inputs: _Inputs) -> Columns:
-        return _in_one_go(shade, inputs)
+        def in_one_go(inputs: _Inputs) -> Columns:
+            zero = varying_zero(inputs)
+            return [c + zero.astype(c.dtype) for c in _in_one_go(shade, inputs)]
+
+        seen = jnp.max(inputs.face) >= 0
+        return lax.cond(seen, in_one_go, _background_alone, inputs)
 
     def derivative(primals: Any, tangents: Any) -> tuple[Columns, Columns]:
         leaves, tree = jax.tree.flatten(primals[0])
@@ -93,11 +102,23 @@ def shade_covered(
 
 def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
     pixels = all_pixels(inputs.face, inputs.drawn.positions_clip.dtype)
-    return shade(inputs.data, points_at(inputs.drawn, pixels), inputs.reached)
+    colors = shade(inputs.data, points_at(inputs.drawn, pixels), inputs.reached)
+    return _before_background(colors, inputs)
+
+
+def _background_alone(inputs: _Inputs) -> Columns:
+    return _before_background([varying_zero(inputs)] * 3, inputs)
+
+
+def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
+    numbers = [leaf for leaf in jax.tree.leaves(inputs) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    dtype = jnp.result_type(*numbers)
+    pairs = zip(colors, inputs.background, strict=True)
+    return [jnp.where(inputs.face >= 0, c, behind).astype(dtype) for c, behind in pairs]
 
 
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
-    data, drawn, face, reached = inputs
+    data, drawn, face, reached, _ = inputs
     dtype = drawn.positions_clip.dtype
     runs = _covered_runs(face)
     number = _batched(runs.chosen[:, None] * RUN + jnp.arange(RUN))
@@ -125,7 +146,7 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
 
     batches = (first, *pixels[:3], carried, parts)
     colors = lax.map(jax.checkpoint(step, prevent_cse=False), batches)
-    return [_put_back(color, runs, face.shape) for color in colors]
+    return _before_background([_put_back(color, runs, face.shape) for color in colors], inputs)
 
 
 def _covered_runs(face: Array) -> _Runs:

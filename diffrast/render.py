@@ -123,8 +123,8 @@ def render(
         in_batches = settings.shading == "phong" and not world.paints
 
         shader = SHADERS[settings.shading]
-        color = shade_covered(shader, world, drawn, face, reached, in_batches=in_batches)
-        color = [jnp.where(face >= 0, color[c], background[..., c]) for c in range(3)]
+        behind = [background[..., c] for c in range(3)]
+        color = shade_covered(shader, world, drawn, face, reached, behind, in_batches=in_batches)
     if settings.antialias:
         with jax.named_scope("edges"):
             image = assemble(stored(color))

@@ -18,7 +18,12 @@ RNG = np.random.default_rng(0)
 WEIGHTS = jnp.asarray(RNG.normal(size=(3, HEIGHT, WIDTH)), jnp.float32)
 LIT = jnp.asarray(RNG.uniform(size=(HEIGHT, WIDTH)), jnp.float32)
 VIEWS = jax.sharding.PartitionSpec("views")
-START = {"eye": jnp.array([0.5, 0.4, 4.0]), "vertices": MESH.vertices, "color": jnp.ones(3)}
+START = {
+    "eye": jnp.array([0.5, 0.4, 4.0]),
+    "vertices": MESH.vertices,
+    "color": jnp.ones(3),
+    "background": jnp.array([0.1, 0.2, 0.3]),
+}
 WAY = jax.tree.map(lambda x: jnp.asarray(RNG.normal(size=x.shape), jnp.float32), START)
 
 
@@ -39,10 +44,11 @@ def colors(params):
     matrix, pivot = pivoted_matrix(camera)
     attributes = params["vertices"], params["vertices"] ** 2
     drawn = Drawn(clip, MESH.faces, attributes, Projection(matrix[np.array([0, 1, 3])], pivot))
+    behind = list(params["background"])
     found = deferred.shade_covered(
-        shade, params["color"], drawn, face, (None, LIT), in_batches=True
+        shade, params["color"], drawn, face, (None, LIT), behind, in_batches=True
     )
-    return jnp.where(face >= 0, jnp.stack(found), 0)
+    return jnp.stack(found)
 
 
 def loss(params):
@@ -87,8 +93,31 @@ def test_batches_under_shard_map_of_vmap_of_grad(whole, small_batches):
     np.testing.assert_allclose(got, [wanted] * 2, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
 
-def test_an_empty_image_has_no_colours(small_batches):
+def test_images_under_shard_map(whole, small_batches):
+    devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
+
+    def of_views(eyes):
+        return jax.lax.map(lambda eye: colors(START | {"eye": eye}), eyes)
+
+    mapped = jax.shard_map(of_views, mesh=devices, in_specs=VIEWS, out_specs=VIEWS)
+    got = jax.jit(mapped)(jnp.stack([START["eye"]] * 2))
+    np.testing.assert_allclose(got, jnp.stack([whole[0]] * 2), atol=1e-5)
+
+
+def test_both_precisions_in_one_image(small_batches):
+    with jax.enable_x64(True):
+        mixed = START | {"color": np.ones(3, np.float64)}
+        got = jax.jit(lambda params: colors(params))(mixed)
+        moved, _ = jax.jit(lambda params: jax.jvp(colors, (params,), (params,)))(mixed)
+        assert got.dtype == moved.dtype == jnp.float64
+        np.testing.assert_allclose(got, moved, atol=1e-5)
+
+
+def test_an_empty_image_is_the_background(small_batches):
     away = START | {"vertices": START["vertices"] + 100.0}
     value, gradient = jax.jit(jax.value_and_grad(lambda params: loss(params)))(away)
-    assert value == 0
+    behind = START["background"]
+    weights = np.sum(WEIGHTS, axis=(1, 2))
+    np.testing.assert_allclose(value, np.sum(weights * behind**2), rtol=1e-4)
+    np.testing.assert_allclose(gradient.pop("background"), 2 * weights * behind, rtol=1e-4)
     assert all(np.all(part == 0) for part in jax.tree.leaves(gradient))
