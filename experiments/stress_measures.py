@@ -15,8 +15,19 @@ import numpy as np
 import stress_reference
 import stress_scenes
 from jax import Array
-from stress_reference import AMBIENT, ATTENUATION, BACKGROUND, SHININESS, SPECULAR, Cameras
-from stress_scenes import CONTINUOUS, INVARIANCES, Parts
+from stress_reference import (
+    AMBIENT,
+    ATTENUATION,
+    BACKGROUND,
+    EPSILON,
+    MARGIN,
+    SHININESS,
+    SPECULAR,
+    TOLERANCE,
+    UNKNOWN,
+    Cameras,
+)
+from stress_scenes import CONTINUOUS, INVARIANCES, VERTICES, Parts
 
 import diffrast as dr
 
@@ -48,6 +59,7 @@ GROUPS = {
     "shadows": Group({}, shadow=dr.Shadow(resolution=32), share=0.02),
 }
 EDGE_TOLERANCE = 1e-2  # of a colour: more counts as a pixel that differs
+SHAKES = 8  # pictures in float64 that tell what of one with edges rounding may change
 
 
 # Drawing ------------------------------------------------------------------------------------------
@@ -256,18 +268,42 @@ def failures(measures: Measures) -> Iterator[tuple[str, np.ndarray]]:
             yield name, values > 0
 
 
+def shaken(parts: Parts, size: int, generator: np.random.Generator) -> Parts:
+    """A batch in float64, moved and turned by as much as float32 and snapping may do it."""
+    eye = parts["eye"][:, None]
+    pixel = 2 * np.tan(parts["fov_y"] / 2)[:, None, None] / size
+    distance = np.linalg.norm(parts["vertices"] - eye, axis=-1, keepdims=True)
+    moved = MARGIN * pixel * distance
+    # Points that are seen are rounded: that turns the ways to the lamp and to the eye.
+    rounding = 4 * EPSILON * np.abs(parts["vertices"])
+    turned = rounding / np.where(distance > 0, distance, 1)
+    signs = generator.choice([-1.0, 1.0], size=(3, VERTICES, 3))
+    return parts | {
+        "vertices": parts["vertices"] + moved * signs[0],
+        "normals": parts["normals"] + turned * np.abs(parts["normals"]) * signs[1],
+        "lamp": parts["lamp"] + 4 * EPSILON * np.abs(parts["lamp"]) * signs[2, 0],
+    }
+
+
 def in_double(path: Path) -> None:
     """Draw the batches of a file, in a process whose numbers have twice the digits."""
     with np.load(path) as file:
         given, size = dict(file), int(file["pixels"])
     del given["pixels"]
     draw = jax.jit(jax.vmap(lambda parts: picture(parts, GROUPS["edges"], size)[0]))
-    exact = {key: p if key == "faces" else p.astype(np.float64) for key, p in given.items()}
-    images = [
-        draw({key: part[index] for key, part in exact.items()})
-        for index in range(len(given["faces"]))
-    ]
-    np.save(path.with_suffix(".npy"), np.stack(images))
+    images, changes = [], []
+    for index in range(len(given["faces"])):
+        exact = {
+            key: part[index] if key == "faces" else part[index].astype(np.float64)
+            for key, part in given.items()
+        }
+        image, generator = np.asarray(draw(exact)), np.random.default_rng(0)
+        with np.errstate(all="ignore"):
+            shakes = [shaken(exact, size, generator) for _ in range(SHAKES)]
+        others = (draw(parts) for parts in shakes)
+        images.append(image)
+        changes.append(np.max([np.abs(other - image).max(axis=-1) for other in others], axis=0))
+    np.savez(path.with_name("drawn.npz"), images=images, changes=changes)
 
 
 def float64_measures(batches: list[Parts], images: list[np.ndarray], size: int) -> list[Measures]:
@@ -277,8 +313,21 @@ def float64_measures(batches: list[Parts], images: list[np.ndarray], size: int) 
         np.savez(path, pixels=size, **stress_scenes.stacked(batches))
         command = [sys.executable, __file__, str(path)]
         subprocess.run(command, check=True, env=os.environ | {"JAX_ENABLE_X64": "1"})
-        truths = np.load(path.with_suffix(".npy"))
-    return [share_measures("float64", *pair) for pair in zip(images, truths, strict=True)]
+        with np.load(path.with_name("drawn.npz")) as drawn:
+            truths = zip(images, drawn["images"], drawn["changes"], strict=True)
+    return [against_double(*batch) for batch in truths]
+
+
+def against_double(image: np.ndarray, truth: np.ndarray, change: np.ndarray) -> Measures:
+    """How far pictures are from those in float64, in which shaking changes pixels by `change`."""
+    error = np.abs(np.float64(image) - truth).max(axis=-1)
+    clear = change <= UNKNOWN
+    bound = TOLERANCE * (1 + np.abs(truth).max(axis=-1)) + 8 * change
+    return share_measures("float64", image, truth) | {
+        "float64: wrong": per_scene(clear & ~(error <= bound)),
+        "float64: error": np.where(clear, error, 0).max(axis=(1, 2)),
+        "float64: share unclear": (~clear).mean(axis=(1, 2)),
+    }
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.blend import Method, View, collect
 from diffrast.edges.derivative import apply_linear
+from diffrast.edges.pieces import clip_edges, facing, to_pixels
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -112,6 +113,62 @@ def test_what_thin_faces_hide_shows_no_edge():
     settings = dataclasses.replace(SETTINGS, shading="unlit")
     image = dr.render(dr.Scene(objects=objects), camera((0.0, 0.0, 3.0)), settings)
     np.testing.assert_allclose(image, 1.0, atol=1e-6)
+
+
+def test_a_face_without_area_does_not_double_the_outline():
+    """An octahedron with faces as thin as a line along its outline is as it is without them."""
+    turn = np.asarray(dr.linalg.rotation((1.0, 2.0, 3.0), 0.1), np.float64)[:3, :3]
+    x, y, z = turn.T
+    corners = np.array([x, y, -x, -y, z, -z])
+    middles = (corners[:4] + np.roll(corners[:4], -1, axis=0)) / 2
+    around = [(i, (i + 1) % 4) for i in range(4)]
+    upper = [(a, b, 4) for a, b in around]
+    whole = upper + [(b, a, 5) for a, b in around]
+    split = upper + [f for a, b in around for f in ((b, a, 6 + a), (b, 6 + a, 5), (6 + a, a, 5))]
+    settings = dataclasses.replace(SETTINGS, shading="unlit")
+
+    def drawn(faces):
+        mesh = dr.Mesh(vertices=np.concatenate([corners, middles]), faces=faces)
+        return dr.render(dr.Scene(objects=[dr.Object(mesh)]), camera((0.1, 0.2, 3.0)), settings)
+
+    image, other = drawn(whole), drawn(split)
+    assert np.sum((image > 0.1) & (image < 0.7)) > 60
+    np.testing.assert_allclose(other, image, atol=1e-4)
+
+
+@pytest.mark.parametrize("distance", [1e-2, 1e-4, 1e-6, 1e-9])
+def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance):
+    """Which way they face, and where their edges end in the picture."""
+    size, near = 64, 1e-4
+    points = np.random.default_rng(5).uniform((-2, -2, 0.5), (2, 2, 5), size=(100, 3, 3))
+    points[:, 2] *= distance
+    clip = np.concatenate([points, points[..., 2:]], axis=2).reshape(-1, 4)
+    clip[:, 2] -= 2 * near
+    faces = jnp.arange(300).reshape(-1, 3)
+    pixels = to_pixels(jnp.asarray(clip, jnp.float32), size, size)
+    exact = np.asarray(pixels, np.float64)
+    volume = facing(pixels, faces)
+    truth = np.linalg.det(exact[[0, 1, 3]].T[np.asarray(faces)])
+    np.testing.assert_allclose(volume, truth, rtol=1e-3)
+
+    edges = traced_topology(jnp.asarray(clip, jnp.float32), faces).edges
+    found = clip_edges(
+        jnp.arange(300), jnp.ones(300, bool), edges, faces, pixels, volume, height=size, width=size
+    )
+    start, end = exact[:, np.asarray(found.vertices)].swapaxes(0, 1)
+    x, y, z, w = start
+    dx, dy, dz, dw = end - start
+    # Inside the frustum a + t b >= 0.
+    planes = [(w + z, dw + dz), (x, dx), (y, dy), (size * w - x, size * dw - dx)]
+    planes += [(w - z, dw - dz), (size * w - y, size * dw - dy)]
+    crossings = [(-a / np.where(b == 0, 1, b), b) for a, b in planes]
+    low = np.max([np.where(b > 0, t, -1) for t, b in crossings], axis=0)
+    high = np.min([np.where(b < 0, t, 2) for t, b in crossings], axis=0)
+    seen = np.asarray(found.parts) > 0
+    assert np.sum(seen) > 100
+    at = [start + np.clip(t, 0, 1) * (end - start) for t in (low, high)]
+    wanted = np.stack([p[:2] / p[3] for p in at])
+    np.testing.assert_allclose(found.ends[..., seen], wanted[..., seen], atol=1e-3)
 
 
 def test_no_piece_is_lost_however_few_records_there_are(seen):

@@ -46,6 +46,30 @@ def test_a_failed_scene_is_drawn_again(results, monkeypatch):
     assert stability.replay(results / name)["wrong"] > 0
 
 
+def test_a_picture_with_edges_is_held_to_what_shaking_changes():
+    truth = np.full((1, 4, 4, 3), 0.5)
+    change = np.zeros((1, 4, 4))
+    change[0, 0], change[0, 1] = 1e-3, 0.5  # some doubt, and no telling what is there
+    for error, wrong in ((2e-4, 0), (5e-3, 8), (0.1, 12)):
+        found = stress_measures.against_double(truth + error, truth, change)
+        assert found["float64: wrong"] == wrong
+        assert found["float64: share unclear"] == 0.25
+    assert found["float64: error"] == pytest.approx(0.1)
+
+
+def test_shaking_moves_what_is_seen_by_less_than_a_hundredth_of_a_pixel():
+    parts = stress_scenes.stacked([stress_scenes.case(number).parts for number in (5, 21)])
+    exact = {key: part.astype(float) for key, part in parts.items()}
+    other = stress_measures.shaken(exact, 16, np.random.default_rng(0))
+    forward = stress_scenes.unit(exact["target"] - exact["eye"])[:, None]
+    moved = other["vertices"] - exact["vertices"]
+    away = np.linalg.norm(exact["vertices"] - exact["eye"][:, None], axis=-1)
+    across = np.linalg.norm(moved - forward * np.sum(moved * forward, -1, keepdims=True), axis=-1)
+    pixel = 2 * np.tan(exact["fov_y"] / 2)[:, None] / 16
+    assert 1e-3 < np.max(across / away / pixel) < 1e-2
+    assert np.max(np.abs(other["normals"] - exact["normals"])) < 1e-4
+
+
 def test_scenes_depend_on_their_number_alone():
     for number in (0, 5, 15, 40):
         one, other = stress_scenes.case(number), stress_scenes.case(number)

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._selection import compacted, prefix_sum, selected
 from diffrast._stored import stored
 from diffrast._topology import Edges
+from diffrast.edges.planes import FINE_TOLERANCE, cross_rows, largest, nearest_first
 
 EDGES_AT_ONCE = 512
 CUT_AT_ONCE = 1024
@@ -101,21 +102,23 @@ def scale_by_depth(depth: Depth, positions_clip: Float[Array, "V 4"]) -> Float[A
 def facing(pixels: Float[Array, "4 V"], faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     """Volume det(v0, v1, v2) of x, y, w: negative on front faces, as y points down.
 
-    Zero for faces seen edge-on, as far as rounding can tell.
+    Zero for faces seen edge-on, as far as rounding can tell, and for those with a vertex at the
+    eye. But if their outlines touch, as those of faces without area do, they count as front faces:
+    so one of the faces beside them has an outline there, and not both.
     """
-    (x0, x1, x2), (y0, y1, y2), (w0, w1, w2) = (pixels[i][faces.T] for i in (0, 1, 3))
-    x1, y1, w1, x2, y2, w2 = x1 - x0, y1 - y0, w1 - w0, x2 - x0, y2 - y0, w2 - w0
-    terms = [
-        (x0, y1, w2),
-        (-x0, w1, y2),
-        (y0, w1, x2),
-        (-y0, x1, w2),
-        (w0, x1, y2),
-        (-w0, y1, x2),
-    ]
-    products = [a * b * c for a, b, c in terms]
-    volume, size = sum(products[1:], products[0]), sum(abs(p) for p in products)
-    return stored(jnp.where(abs(volume) > _EDGE_ON * jnp.finfo(size.dtype).eps * size, volume, 0))
+    first, second, third = nearest_first(stored(pixels[jnp.array([0, 1, 3])][:, faces.T]))
+    one, other = second - first, third - first
+    cycles = [(i, (i + 1) % 3, (i + 2) % 3) for i in range(3)]
+    terms = [first[i] * one[j] * other[k] for i, j, k in cycles]
+    terms += [-first[i] * one[k] * other[j] for i, j, k in cycles]
+    volume, size = (sum(t[1:], t[0]) for t in (terms, [abs(term) for term in terms]))
+    info = jnp.finfo(size.dtype)
+    at_eye = largest(first) <= info.eps**1.5 * jnp.maximum(largest(second), largest(third))
+    seen = jnp.maximum(largest(cross_rows(first, one)), largest(cross_rows(first, other)))
+    thin = largest(cross_rows(one, other)) <= FINE_TOLERANCE * seen
+    hardly = jnp.where(thin & ~at_eye, -info.tiny, 0)
+    known = (abs(volume) > _EDGE_ON * info.eps * size) & ~at_eye
+    return stored(jnp.where(known, volume, hardly))
 
 
 def _sides(edges: Edges, volume: Array) -> tuple[Array, Array, Array]:
@@ -166,7 +169,8 @@ def clip_edges(
     heights = [w + z, w - z, x, width * w - x, y, height * w - y]
     inside = jnp.stack(positive_part([h[0] for h in heights], [h[1] for h in heights]))
     first, last = at[jnp.array([0, 1, 3])].swapaxes(0, 1)
-    clipped = first[:, None] + inside * (last - first)[:, None]  # (x, y, w; 2 ends; n)
+    rest = jnp.stack(positive_part([h[1] for h in heights], [h[0] for h in heights])[::-1])
+    clipped = rest * first[:, None] + inside * last[:, None]  # (x, y, w; 2 ends; n)
     weights = jnp.where(clipped[2] > 0, 1 / jnp.where(clipped[2] > 0, clipped[2], 1), 0)
     size = jnp.array([width, height], weights.dtype)[None, :, None]
     ends = stored(jnp.clip((clipped[:2] * weights).swapaxes(0, 1), 0, size))

@@ -24,6 +24,27 @@ def cross_rows(a: Array, b: Array) -> Array:
     )
 
 
+def largest(vectors: Array) -> Array:
+    """The largest size of the three components, which are rows."""
+    return jnp.maximum(jnp.maximum(abs(vectors[0]), abs(vectors[1])), abs(vectors[2]))
+
+
+def nearest_first(corners: Array) -> tuple[Array, Array, Array]:
+    """The three corners of faces (x, y, w; corner; ...) in turn, beginning with the smallest.
+
+    What is computed from the differences to a corner near the eye loses nothing.
+    """
+    size = largest(corners)
+    second = (size[1] < size[0]) & (size[1] <= size[2])
+    third = (size[2] < size[0]) & (size[2] < size[1])
+
+    def turned(first: int) -> Array:
+        one, two, three = (corners[:, (first + k) % 3] for k in range(3))
+        return jnp.where(third, three, jnp.where(second, two, one))
+
+    return turned(0), turned(1), turned(2)
+
+
 def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) -> Array:
     """x, y and w of the three corners of faces, shape (3, 3, *n)."""
     return stored(pixels[jnp.array([0, 1, 3])][:, stored(faces.T[:, jnp.maximum(face, 0)])])
@@ -74,13 +95,14 @@ def barycentrics(values: Columns) -> Columns:
     return [value * inverse_total for value in values]
 
 
-def inverse_depth_slope(corners: Array, direction: Array) -> Array:
-    """Change of 1/w along a direction (2, n) on the screen; 0 on faces seen edge-on."""
-    first, one, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    gx, gy, gw = cross_rows(one, other)
-    volume = first[0] * gx + first[1] * gy + first[2] * gw
-    safe = jnp.where(volume == 0, 1, volume)
-    return jnp.where(volume == 0, 0, (gx * direction[0] + gy * direction[1]) / safe)
+def inverse_depth_slope(corners: Array, volume: Array, direction: Array) -> Array:
+    """Change of 1/w along a direction (2, n) on the screen; 0 on faces seen edge-on.
+
+    `volume` is that of the faces, as exact as `facing` finds it.
+    """
+    gx, gy, _ = cross_rows(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    seen = abs(volume) > jnp.finfo(volume.dtype).tiny
+    return jnp.where(seen, gx * direction[0] + gy * direction[1], 0) / jnp.where(seen, volume, 1)
 
 
 def area(corners: Array) -> Array:

@@ -152,7 +152,7 @@ def look(
     # Of two faces of a fold, the one that comes nearer away from the edge is seen.
     inward = jnp.where(first_on_right, normal, -normal)
     face_corners = corners_of(own, faces, pixels)
-    slopes = inverse_depth_slope(face_corners, inward[:, None])
+    slopes = inverse_depth_slope(face_corners, volume[jnp.maximum(own, 0)], inward[:, None])
     use_first = (own[0] >= 0) & (~fold | (own[1] < 0) | (slopes[0] >= slopes[1]))
     front, other = jnp.where(use_first, own, own[::-1])
     front_corners, other_corners = jnp.where(use_first, own_corners, own_corners[::-1])
