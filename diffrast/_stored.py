@@ -34,6 +34,17 @@ def stored(values: T, witness: Array | None = None) -> T:
     return jax.tree.map(store, values)
 
 
+@jax.custom_jvp
+def stored_alone(value: Array) -> Array:
+    """Store an array, and leave its derivative to whatever takes it: no pass over it is added."""
+    return stored(value)
+
+
+@stored_alone.defjvp
+def _derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return stored_alone(*primals), tangents[0]
+
+
 def stored_rows(values: Array) -> Array:
     """Store a (V, C) array, each of its columns computed once."""
     return assemble(stored([values[:, i] for i in range(values.shape[1])]))

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast._check import instance_of
-from diffrast._stored import assemble, stored
+from diffrast._stored import assemble, stored, stored_alone
 from diffrast.camera import Camera
 from diffrast.deferred import shade_covered
 from diffrast.edges import Glow, Shader, View, antialias_image
@@ -298,7 +298,7 @@ def _pixels(color: Columns, side: int) -> Array:
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
     # A loop over views would else compute the colours where it puts them into place, on one core.
-    return stored(assemble(stored(color)))
+    return stored_alone(assemble(stored(color)))
 
 
 def _box_average(channel: Array, side: int) -> Array:
