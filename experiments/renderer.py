@@ -8,6 +8,7 @@ acceleration structure. Pictures come back as arrays of the host. The other rend
 `peers.py`.
 """
 
+import abc
 import dataclasses
 from typing import Any, ClassVar
 
@@ -58,7 +59,7 @@ class Task:
         return float(self.camera.projection[1, 1])
 
 
-class Peer:
+class Peer(abc.ABC):
     """A renderer: `image` draws, `gradient` differentiates the squared difference to a target."""
 
     name: ClassVar[str]
@@ -70,13 +71,13 @@ class Peer:
     def __init__(self, task: Task) -> None:
         self.task = task
 
+    @abc.abstractmethod
     def image(self) -> np.ndarray:
         """The picture, (size, size, 3)."""
-        raise NotImplementedError
 
     def gradient(self, target: np.ndarray) -> np.ndarray:
         """Of the summed squared difference to a target by the parameters, (12,)."""
-        raise NotImplementedError
+        raise TypeError(f"{self.name} draws only: it has no derivatives")
 
 
 def with_samples(kind: type[Peer], side: int) -> type[Peer]:

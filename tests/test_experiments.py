@@ -68,7 +68,8 @@ def test_robustness_compares_methods_and_goes_on(tmp_path, monkeypatch):
     levels = [fitting.Level(1, 4, 4.0, 20, False), fitting.Level(1, 4, 1.0, 20, True)]
     search = optax.lbfgs()
     monkeypatch.setattr(fit_robustness, "optimizer", lambda *_: search)
-    monkeypatch.setattr(fit_robustness, "METHODS", ("levenberg_marquardt", "l_bfgs"))
+    methods = ("levenberg_marquardt", "several_lights", "l_bfgs")
+    monkeypatch.setattr(fit_robustness, "METHODS", methods)
 
     def without_edges(mesh, view, height, width, samples=4):
         return common.render_view(mesh, view, height, width, samples, antialias=False)
@@ -77,12 +78,14 @@ def test_robustness_compares_methods_and_goes_on(tmp_path, monkeypatch):
     asked = {"problems": ["light"], "starts": 1, "size": 32, "divisions": 2, "steps": 2}
     asked["methods"] = fit_robustness.METHODS
     report = fit_robustness.run(tmp_path, levels=levels, **asked)
-    lm, lbfgs = (report["found"]["light"][name] for name in fit_robustness.METHODS)
+    lm, several, lbfgs = (report["found"]["light"][name] for name in fit_robustness.METHODS)
     assert lm["median_light_0_degrees"] < 1
+    assert several["median_light_0_degrees"] < 1
+    assert several["median_renders"] > 4 * lm["median_renders"]
     assert lbfgs["share_converged"] == 0
     assert lbfgs["median_renders"] > 2 * 3  # line searches are counted
     stored = json.loads((tmp_path / "fit_robustness.json").read_text())
-    assert [len(rows) for rows in stored["starts"]["light"].values()] == [1, 1]
+    assert [len(rows) for rows in stored["starts"]["light"].values()] == [1, 1, 1]
     assert (tmp_path / "fit_robustness.png").is_file()
     assert (tmp_path / "failures_l_bfgs.png").is_file()
 
@@ -93,6 +96,19 @@ def test_robustness_compares_methods_and_goes_on(tmp_path, monkeypatch):
     assert again["found"] == stored["found"]
     with pytest.raises(ValueError, match="wanted a report of"):
         fit_robustness.run(tmp_path, levels=levels, **(asked | {"steps": 3}))
+
+
+def test_some_light_of_several_is_near_any():
+    params = {"lights": [{"move": np.zeros(2), "diffuse": np.ones(3)}]}
+    moves = [other["lights"][0]["move"] for other in fit_robustness.lights_around(params)]
+    light = np.array([0.1, -0.5, 0.4])
+    tried = np.stack([dr.fit.direction_update(light, move) for move in moves])
+    anywhere = np.random.default_rng(0).normal(size=(1000, 3))
+    anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
+    nearest = np.degrees(np.arccos(np.max(anywhere @ tried.T, axis=1)))
+    assert len(tried) == 9
+    assert nearest.max() < 55
+    assert fit_robustness.lights_around({"camera": 1}) == [{"camera": 1}]
 
 
 def test_starts_are_as_far_off_as_they_say(problem):
