@@ -46,6 +46,7 @@ def own(task):
 
 class Absent(renderer.Peer):
     name = "absent"
+    image = None
 
     def __init__(self, task):
         raise renderer.MissingPeerError("absent needs what is not there")
