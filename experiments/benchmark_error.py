@@ -27,8 +27,8 @@ Written to `--out`: `benchmark_error.json`, `.md` (the fronts, then everything) 
 Expected: "edges" with one sample is more exact than 16 samples without, and faster; more samples
 with edges lower the error further, near to that of the truth. Derivatives of moving outlines need
 edges, whatever the samples. Float64 costs more and changes no error. Trilinear filters beat 16
-samples, if with anisotropy. A finer shadow map helps the picture where there are edges, and
-hardly where there are none. Finer meshes lower the error until that of the pixels is left. How
+samples, if with anisotropy. Up to 512 rows a finer shadow map helps the picture where there are
+edges, and hardly where there are none. Finer meshes lower the error until that of the pixels is left. How
 long: twenty minutes on two cores, most of it compilation; `--families` and `--scenes` choose.
 """
 
