@@ -28,8 +28,9 @@ Expected: "edges" with one sample is more exact than 16 samples without, and fas
 with edges lower the error further, near to that of the truth. Derivatives of moving outlines need
 edges, whatever the samples. Float64 costs more and changes no error. Trilinear filters beat 16
 samples, if with anisotropy. Up to 512 rows a finer shadow map helps the picture where there are
-edges, and hardly where there are none. Finer meshes lower the error until that of the pixels is left. How
-long: twenty minutes on two cores, most of it compilation; `--families` and `--scenes` choose.
+edges, and hardly where there are none. Finer meshes lower the error until that of the pixels is
+left. How long: twenty minutes on two cores, most of it compilation; `--families` and `--scenes`
+choose.
 """
 
 import json
