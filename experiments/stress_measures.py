@@ -23,8 +23,6 @@ from stress_reference import (
     MARGIN,
     SHININESS,
     SPECULAR,
-    TOLERANCE,
-    UNKNOWN,
     Cameras,
 )
 from stress_scenes import CONTINUOUS, INVARIANCES, VERTICES, Parts
@@ -178,9 +176,9 @@ def finite_measures(parts: Parts, found: Drawn) -> Measures:
     return measures | {"directions apart": apart / np.where(size > 0, size, 1)}
 
 
-def reference_measures(found: Drawn, truth: stress_reference.Reference) -> Measures:
+def reference_measures(image: np.ndarray, truth: stress_reference.Reference) -> Measures:
     """How far pictures are from those in float64."""
-    error = np.abs(np.float64(found.image) - truth.image).max(axis=-1)
+    error = np.abs(np.float64(image) - truth.image).max(axis=-1)
     differs = ~(error <= truth.bound)
     clear = np.where(truth.clear, error, 0)
     return {
@@ -206,13 +204,13 @@ def plain_measures(parts: Parts, found: Drawn) -> Measures:
     """Against float64, and against the same scenes changed without effect."""
     size = found.image.shape[1]
     truth = stress_reference.reference(parts, cameras_of(found), size)
-    measures = reference_measures(found, truth)
+    measures = reference_measures(found.image, truth)
     for change in INVARIANCES:
         other_parts = changed(change, parts)
         other = drawn("plain", other_parts, size)
         if change == "rigid motion":  # which rounds: what is seen then is another scene
             moved = stress_reference.reference(other_parts, cameras_of(other), size)
-            measures[f"{change}: wrong"] = reference_measures(other, moved)["wrong"]
+            measures[f"{change}: wrong"] = reference_measures(other.image, moved)["wrong"]
             apart = np.abs(other.image - found.image).max(axis=-1)
             clear = (
                 moved.clear
@@ -288,15 +286,14 @@ def shaken(parts: Parts, size: int, generator: np.random.Generator) -> Parts:
 def in_double(path: Path) -> None:
     """Draw the batches of a file, in a process whose numbers have twice the digits."""
     with np.load(path) as file:
-        given, size = dict(file), int(file["pixels"])
-    del given["pixels"]
+        given = {
+            key: part if key == "faces" else part.astype(np.float64) for key, part in file.items()
+        }
+    size = int(given.pop("pixels"))
     draw = jax.jit(jax.vmap(lambda parts: picture(parts, GROUPS["edges"], size)[0]))
     images, changes = [], []
     for index in range(len(given["faces"])):
-        exact = {
-            key: part[index] if key == "faces" else part[index].astype(np.float64)
-            for key, part in given.items()
-        }
+        exact = {key: part[index] for key, part in given.items()}
         image, generator = np.asarray(draw(exact)), np.random.default_rng(0)
         with np.errstate(all="ignore"):
             shakes = [shaken(exact, size, generator) for _ in range(SHAKES)]
@@ -321,8 +318,7 @@ def float64_measures(batches: list[Parts], images: list[np.ndarray], size: int) 
 def against_double(image: np.ndarray, truth: np.ndarray, change: np.ndarray) -> Measures:
     """How far pictures are from those in float64, in which shaking changes pixels by `change`."""
     error = np.abs(np.float64(image) - truth).max(axis=-1)
-    clear = change <= UNKNOWN
-    bound = TOLERANCE * (1 + np.abs(truth).max(axis=-1)) + 8 * change
+    clear, bound = stress_reference.held_to(truth, change)
     return share_measures("float64", image, truth) | {
         "float64: wrong": per_scene(clear & ~(error <= bound)),
         "float64: error": np.where(clear, error, 0).max(axis=(1, 2)),

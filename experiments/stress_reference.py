@@ -80,10 +80,18 @@ def reference(parts: Parts, cameras: Cameras, size: int) -> Reference:
             other, other_image = draw(4 * EPSILON, corner)
             clear = clear & (other.face == seen.face)
             change = np.maximum(change, np.abs(other_image - image).max(axis=-1))
-    clear &= change <= UNKNOWN
-    bound = TOLERANCE * (1 + np.abs(image).max(axis=-1)) + 8 * change
+    known, bound = held_to(image, change)
+    clear &= known
     square = (count, size, size)
     return Reference(image.reshape(*square, 3), clear.reshape(square), bound.reshape(square))
+
+
+def held_to(image: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels mean something, and how far these may be off.
+
+    `change`, (...), is what shaking changes of `image`, (..., 3).
+    """
+    return change <= UNKNOWN, TOLERANCE * (1 + np.abs(image).max(axis=-1)) + 8 * change
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
