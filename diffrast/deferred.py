@@ -4,7 +4,8 @@ A picture alone is shaded in one go, a large one only if it shows a face. With i
 are hundreds of values for each pixel between faces and colours, more than memory can pass along in
 good time: so the image is cut into runs of pixels, runs without a face are left out, and the others
 are shaded in batches that stay in cache. A reverse pass goes through the batches again and begins
-by repeating each.
+by repeating each. Very large pictures are shaded so without a derivative, too: temporary memory of
+more than 32 MB is given back after each call, and a new one costs more than the shading.
 """
 
 from collections.abc import Callable
@@ -20,19 +21,19 @@ from diffrast._selection import compacted
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
-from diffrast.raster.evaluate import Drawn, all_pixels, carry, pixels_at
+from diffrast.raster.evaluate import Drawn, Pixels, all_pixels, carry, pixels_at
 from diffrast.shadows import Reached
 
 RUN = 32  # pixels
 RUNS_AT_ONCE = 512
 LARGE = 1 << 17  # pixels: what smaller images need is fast to store
+VERY_LARGE = 5 << 16  # pixels: the same without a derivative
 
 
 class _Runs(NamedTuple):
     """The runs of an image's pixels, row by row, that hold something."""
 
-    chosen: Int[Array, " places"]  # numbers of runs; behind the last one that of no run
-    place: Int[Array, " runs"]  # of each run among these; that of none if it is left out
+    chosen: Int[Array, " places"]  # numbers of runs, ascending; behind the last one of no run
     total: Int[Array, ""]  # that hold something
 
 
@@ -69,7 +70,7 @@ def shade_covered(
         face: that each pixel sees, -1 for none.
         reached: by each light; images.
         background: numbers or images.
-        in_batches: whether derivatives of large images are.
+        in_batches: whether very large images and derivatives of large ones are.
     """
     inputs = _Inputs(data, drawn, face, reached, background)
     if not in_batches or face.size <= LARGE:
@@ -81,6 +82,8 @@ def shade_covered(
             zero = varying_zero(inputs)
             return [c + zero.astype(c.dtype) for c in _in_one_go(shade, inputs)]
 
+        if face.size > VERY_LARGE:
+            return _in_batches(shade, inputs)
         seen = jnp.max(inputs.face) >= 0
         return lax.cond(seen, in_one_go, _background_alone, inputs)
 
@@ -119,33 +122,34 @@ def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
 
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     data, drawn, face, reached, _ = inputs
-    dtype = drawn.positions_clip.dtype
-    runs = _covered_runs(face)
-    number = _batched(runs.chosen[:, None] * RUN + jnp.arange(RUN))
-    row, column = number // face.shape[1], number % face.shape[1]
-    pixels = pixels_at(_batched(_taken(face, runs, -1)), row, column, face.shape, dtype)
-    parts = tuple(None if part is None else _batched(_taken(part, runs, 0)) for part in reached)
+    runs, faces = _covered_runs(face), _in_runs(face, -1)
+    parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
-    carried = carry(drawn, pixels) if many else None
-    data, drawn, pixels, carried, parts, total = varying_alike(
-        (data, drawn, pixels, carried, parts, runs.total)
-    )
-    first = jnp.arange(pixels.face.shape[0]) * RUNS_AT_ONCE + 0 * total
+    data, drawn, faces, parts, runs = varying_alike((data, drawn, faces, parts, runs))
+    dtype = drawn.positions_clip.dtype
+
+    def pixels_of(runs: Array) -> Pixels:
+        number = runs[..., None] * RUN + jnp.arange(RUN)
+        number = number.reshape(*runs.shape[:-1], -1)
+        seen = faces.at[runs].get(mode="fill", fill_value=-1).reshape(number.shape)
+        return pixels_at(seen, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
+
+    chosen = runs.chosen.reshape(-1, RUNS_AT_ONCE)
+    carried = carry(drawn, pixels_of(chosen)) if many else None
 
     def shade_batch(batch: Any) -> Columns:
-        _, face, x, y, carried, reached = batch
-        points = points_at(drawn, pixels._replace(face=face, x=x, y=y), carried)
-        return shade(data, points, reached)
+        _, runs, carried, reached = batch
+        return shade(data, points_at(drawn, pixels_of(runs), carried), reached)
 
     def no_colors(batch: Any) -> Columns:
-        return [jnp.zeros_like(batch[2])] * 3
+        return [jnp.zeros(RUNS_AT_ONCE * RUN, dtype) + 0 * runs.total] * 3
 
     def step(batch: Any) -> Columns:
-        return lax.cond(batch[0] < total, shade_batch, no_colors, batch)
+        return lax.cond(batch[0] < runs.total, shade_batch, no_colors, batch)
 
-    batches = (first, *pixels[:3], carried, parts)
-    colors = lax.map(jax.checkpoint(step, prevent_cse=False), batches)
+    first = jnp.arange(chosen.shape[0]) * RUNS_AT_ONCE + 0 * runs.total
+    colors = lax.map(jax.checkpoint(step, prevent_cse=False), (first, chosen, carried, parts))
     return _before_background([_put_back(color, runs, face.shape) for color in colors], inputs)
 
 
@@ -153,12 +157,10 @@ def _covered_runs(face: Array) -> _Runs:
     in_runs = _in_runs(face, -1)
     covered = jnp.max(in_runs, axis=1) >= 0
     count = covered.shape[0]
-    places = -(-count // RUNS_AT_ONCE) * RUNS_AT_ONCE
+    number = jnp.arange(-(-count // RUNS_AT_ONCE) * RUNS_AT_ONCE)
     chosen, total = compacted(covered, jnp.arange(count, dtype=jnp.int32))
-    chosen = jnp.where(jnp.arange(count) < total, chosen, count)
-    chosen = jnp.pad(chosen, (0, places - count), constant_values=count)
-    place = jnp.full(count + 1, places).at[chosen].set(jnp.arange(places), mode="drop")[:-1]
-    return _Runs(chosen, place, total)
+    chosen = jnp.pad(chosen, (0, number.size - count))
+    return _Runs(jnp.where(number < total, chosen, count + number), total)
 
 
 def _in_runs(image: Array, fill: float) -> Array:
@@ -167,14 +169,16 @@ def _in_runs(image: Array, fill: float) -> Array:
     return flat.reshape(-1, RUN)
 
 
-def _taken(image: Array, runs: _Runs, fill: float) -> Array:
-    return _in_runs(image, fill).at[runs.chosen].get(mode="fill", fill_value=fill)
-
-
-def _batched(pixels: Array) -> Array:
-    return pixels.reshape(-1, RUNS_AT_ONCE * RUN)
+def _taken(in_runs: Array, runs: _Runs) -> Array:
+    taken = in_runs.at[runs.chosen].get(mode="fill", fill_value=0)
+    return taken.reshape(-1, RUNS_AT_ONCE * RUN)
 
 
 def _put_back(values: Array, runs: _Runs, shape: tuple[int, ...]) -> Array:
-    rows = values.reshape(-1, RUN).at[runs.place].get(mode="fill", fill_value=0)
-    return rows.reshape(-1)[: shape[0] * shape[1]].reshape(shape)
+    size = shape[0] * shape[1]
+    rows = jnp.zeros((-(-size // RUN), RUN), values.dtype)
+    # The transpose of an addition is a gather, which needs no zeros to begin with.
+    rows = rows.at[runs.chosen].add(
+        values.reshape(-1, RUN), mode="drop", indices_are_sorted=True, unique_indices=True
+    )
+    return rows.reshape(-1)[:size].reshape(shape)

@@ -127,7 +127,7 @@ def render(
         color = shade_covered(shader, world, drawn, face, reached, behind, in_batches=in_batches)
     if settings.antialias:
         with jax.named_scope("edges"):
-            image = assemble(stored(color))
+            image = assemble([stored_alone(channel) for channel in color])
             image = _with_edges(image, world, clip, pixels, reached, background, settings)
         if side == 1:
             return image

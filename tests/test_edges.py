@@ -190,17 +190,17 @@ def test_no_piece_is_lost_however_few_records_there_are(seen):
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
         method = Method(None, None, False, capacity)
-        found = collect(view, method)
+        records, sums = collect(view, method)
 
         def change(points, colors):
-            return apply_linear(view, method, found, points, colors)
+            return apply_linear(view, method, records, sums.rims, points, colors)
 
         points = jnp.ones((len(clip), 3)) * 0.1
         colors = jnp.ones((face.size, 3)) * jnp.arange(3.0)
         pushed, pull = jax.vjp(change, points, colors)
         return (
-            found.records.total,
-            found.added,
+            records.total,
+            sums.added,
             pushed,
             pull(jnp.sin(jnp.arange(pushed.size)).reshape(pushed.shape)),
         )

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import Blended, Glow, Method, Shader, View, collect
+from diffrast.edges.blend import Glow, Method, Shader, Sums, View, collect
 from diffrast.edges.derivative import apply_linear, linear_zeros
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -155,16 +155,16 @@ def antialias_image(
     view = view._replace(positions_clip=positions_clip, scale=scale)
     gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
 
-    def with_edges(image: Array, found: Blended) -> Array:
+    def with_edges(image: Array, sums: Sums) -> Array:
         added, low, high = (
-            part.reshape(height, width, channels) for part in (found.added, *found.range)
+            part.reshape(height, width, channels) for part in (sums.added, *sums.range)
         )
         return jnp.clip(image[1:-1, 1:-1] + added, low, high)
 
     @jax.custom_jvp
     def blended(image: Array, positions_clip: Array, rest: View) -> Array:
         now = rest._replace(image=image, positions_clip=positions_clip)
-        return with_edges(image, gather(now))
+        return with_edges(image, gather(now).sums)
 
     def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
         image, positions_clip, rest = primals
@@ -174,11 +174,12 @@ def antialias_image(
         if isinstance(d_clip, SymbolicZero):
             d_clip = linear_zeros(positions_clip.shape, d_image)
         now = lax.stop_gradient(rest._replace(image=image, positions_clip=positions_clip))
-        found = gather(now)
+        records, sums = gather(now)
         x, y, _, w = to_pixels(d_clip, height, width)
         points = jnp.stack([x, y, w], axis=-1)
-        d_out = apply_linear(now, method, found, points, d_image.reshape(-1, channels))
-        return with_edges(image, found), d_out.reshape(height, width, channels)
+        colors = d_image.reshape(-1, channels)
+        d_out = apply_linear(now, method, records, sums.rims, points, colors)
+        return with_edges(image, sums), d_out.reshape(height, width, channels)
 
     blended.defjvp(derivative, symbolic_zeros=True)
     return blended(view.image, view.positions_clip, lax.stop_gradient(view))

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import over_batches, prefix_sum
@@ -103,13 +102,19 @@ class Records(NamedTuple):
     motion: Float[Array, "capacity 6"]  # of the area with x, y, w of the two vertices
 
 
-class Blended(NamedTuple):
+class Sums(NamedTuple):
     """What the pieces do to the picture."""
 
-    records: Records
     added: Float[Array, "pixels channels"]
     range: tuple[Array, Array]  # least and greatest colours that each pixel holds
     rims: Float[Array, " pixels_with_border"]  # length of smooth rims about a pixel's centre
+
+
+class Blended(NamedTuple):
+    """The pieces, and what they add up to; None where only more records are asked for."""
+
+    records: Records
+    sums: Sums | None
 
 
 def perimeter(x: Array, y: Array) -> Array:
@@ -144,10 +149,10 @@ def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
     return jnp.stack([total * across, total * down, -moment], axis=1).reshape(6, -1)
 
 
-def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
+def collect(view: View, method: Method, first: Array | None = None) -> Blended:
     """Find the visible pieces, and the sum of what they add to the image.
 
-    `first` is the number of the visible piece from which on they are recorded.
+    With `first`, the number of a visible piece, only records are made, from that piece on.
     """
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     edges = view.topology.edges
@@ -198,7 +203,9 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
         start = ends[-1] & 0, none_waiting(segments), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    nothing = _nothing(view, method, edge_count & 0)
+    # Made of the image: else what it is added to would be made, and held, before the image is.
+    zero = stored(edge_count & 0, view.image[0, 0, 0])
+    nothing = _nothing(view, method, first, zero)
     blended = over_batches(order, edge_count, EDGES_AT_ONCE, add_edges, nothing)
     if view.topology.bodies is not None:
         blended = _add_piercing(blended, view, method, pixels, volume, first)
@@ -208,7 +215,7 @@ def collect(view: View, method: Method, first: ArrayLike = 0) -> Blended:
 
 
 def _add_piercing(
-    total: Blended, view: View, method: Method, pixels: Array, volume: Array, first: ArrayLike
+    total: Blended, view: View, method: Method, pixels: Array, volume: Array, first: Array | None
 ) -> Blended:
     """Add the lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
@@ -231,7 +238,7 @@ def _add_piercing(
 
 
 def _add_shadows(
-    total: Blended, view: View, cast: Cast, method: Method, pixels: Array, first: ArrayLike
+    total: Blended, view: View, cast: Cast, method: Method, pixels: Array, first: Array | None
 ) -> Blended:
     """Add the outlines of shadows."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
@@ -256,10 +263,9 @@ def _add_shadows(
     return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
 
 
-def _nothing(view: View, method: Method, zero: Array) -> Blended:
+def _nothing(view: View, method: Method, first: Array | None, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
-    (height, width, channels), dtype = view.image.shape, view.image.dtype
-    rows, own = method.capacity, cropped(view.image, view.image.shape)
+    rows, channels, dtype = method.capacity, view.image.shape[2], view.image.dtype
     records = Records(
         zero,
         jnp.zeros((rows, 6), jnp.int32) + zero,
@@ -267,9 +273,10 @@ def _nothing(view: View, method: Method, zero: Array) -> Blended:
         jnp.zeros((rows, 2), dtype) + zero,
         jnp.zeros((rows, 6), dtype) + zero,
     )
-    return Blended(
-        records, jnp.zeros_like(own) + zero, (own, own), jnp.zeros(height * width, dtype) + zero
-    )
+    if first is not None:
+        return Blended(records, None)
+    own, rims = cropped(view.image, view.image.shape), jnp.zeros(view.face_image.size, dtype)
+    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims + zero))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
@@ -299,7 +306,7 @@ def _with_pieces(
     segments: Segments,
     pieces: Pieces,
     found: Seen,
-    first: ArrayLike,
+    first: Array | None,
 ) -> Blended:
     """Add pieces of edges."""
     rim = found.rim
@@ -339,8 +346,9 @@ def _with_pieces(
     used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
     held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
     rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
-    total = total._replace(rims=total.rims.at[places[0]].add(rim_length))
-    total, pixel = _with_values(total, view, pieces.pixel, used, value, held)
+    sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
+    if sums is not None:
+        sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),
@@ -348,11 +356,11 @@ def _with_pieces(
         jnp.stack([area, rim_length], axis=-1),
         stored(outward * _motion(segments, pieces, found)).T,
     )
-    return total._replace(records=_with_rows(total.records, used, rows, first))
+    return Blended(_with_rows(total.records, used, rows, first), sums)
 
 
 def _with_line(
-    total: Blended, view: View, method: Method, pixel: Array, line: Line, first: ArrayLike
+    total: Blended, view: View, method: Method, pixel: Array, line: Line, first: Array | None
 ) -> Blended:
     """Add one line in each pixel where surfaces pierce each other."""
     area = _area(line.begin, line.end)
@@ -364,12 +372,13 @@ def _with_line(
         right, left = _shade(view, method, *points)
     jump = stored(right - left)
     value = area[:, None] * jump
-    total, own = _with_values(total, view, pixel, line.used, value, jnp.stack([right, left]))
+    held = jnp.stack([right, left])
+    sums, own = _with_values(total.sums, view, pixel, line.used, value, held)
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
     use = jnp.stack([line.used] * 3)
     records = _with_lines(total.records, use, own, places, jump, area, corners, motion, first)
-    return total._replace(records=records)
+    return Blended(records, sums)
 
 
 def _with_shadow(
@@ -379,7 +388,7 @@ def _with_shadow(
     pixel: Array,
     light: Array,
     line: Shadow,
-    first: ArrayLike,
+    first: Array | None,
 ) -> Blended:
     """Add one line in each pixel across which a light begins."""
     assert method.glow is not None
@@ -391,13 +400,13 @@ def _with_shadow(
     to_other = jnp.where(line.centre_is_lit, -1, 1)[:, None] * glow
     value = area[:, None] * jump + jnp.where(line.wrong_side[:, None], to_other, 0)
     held = jnp.stack([own, own + to_other])
-    total, number = _with_values(total, view, pixel, line.used, value, held)
+    sums, number = _with_values(total.sums, view, pixel, line.used, value, held)
     places = [_place(view, pixel, look) for look in line.look]
     use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
     records = _with_lines(
         total.records, use, number, places, jump, area, line.vertices, line.motion, first
     )
-    return total._replace(records=records)
+    return Blended(records, sums)
 
 
 def _with_lines(
@@ -409,7 +418,7 @@ def _with_lines(
     area: Array,
     vertices: Array,
     motion: Array,
-    first: ArrayLike,
+    first: Array | None,
 ) -> Records:
     """Record lines that move with more vertices, as several rows each: two in every row."""
     rows = [
@@ -426,10 +435,12 @@ def _with_lines(
 
 
 def _with_values(
-    total: Blended, view: View, pixel: Array, used: Array, value: Array, held: Array
-) -> tuple[Blended, Array]:
+    total: Sums | None, view: View, pixel: Array, used: Array, value: Array, held: Array
+) -> tuple[Sums | None, Array]:
     """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
     number = stored(jnp.where(used, pixel[1] * (view.image.shape[1] - 2) + pixel[0], 0))
+    if total is None:
+        return None, number
     added = total.added.at[number].add(jnp.where(used[:, None], value, 0))
     low, high = total.range
     low = low.at[number].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
@@ -437,11 +448,13 @@ def _with_values(
     return total._replace(added=added, range=(low, high)), number
 
 
-def _with_rows(records: Records, used: Array, rows: tuple[Array, ...], first: ArrayLike) -> Records:
+def _with_rows(
+    records: Records, used: Array, rows: tuple[Array, ...], first: Array | None
+) -> Records:
     """Write rows behind those in use, as far as there is room."""
     capacity = records.jump.shape[0]
     ends = prefix_sum(used.astype(jnp.int32))
-    slot = records.total + ends - 1 - first
+    slot = records.total + ends - 1 - (0 if first is None else first)
     slot = jnp.where(used & (slot >= 0), slot, capacity)
     columns = (
         old.at[slot].set(new.astype(old.dtype), mode="drop")

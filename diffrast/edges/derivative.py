@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrast.edges.blend import Blended, Method, Records, View, collect, cropped
+from diffrast.edges.blend import Method, Records, View, collect, cropped
 
 _ROWS_AT_ONCE = 1024
 
@@ -37,36 +37,43 @@ def _over_pieces(
     method: Method,
     records: Records,
     adds: Sequence[Callable[[Array, Any, Any], Any]],
-    start: Any,
+    total: Any,
 ) -> Any:
-    """Add up over all visible pieces, once with each of `adds`.
+    """Add up over all visible pieces, once with each of one or two `adds`.
 
     The pieces that are not recorded are found again, as many at a time as there are rows.
     """
     rounds = jnp.maximum((records.total + method.capacity - 1) // method.capacity, 1)
-
-    def another(n: Array) -> Records:
-        more = collect(view, method, n * method.capacity).records
-        return more._replace(total=more.total - n * method.capacity)
+    more = rounds - 1
 
     def step(n: Array, total: Any) -> Any:
-        rows = lax.cond(n % rounds == 0, lambda _: records, another, n % rounds)
+        first = (n % more + 1) * method.capacity
+        rows = collect(view, method, first).records
+        rows = rows._replace(total=rows.total - first)
         branches = [lambda total, add=add: _over_rows(rows, add, total) for add in adds]
-        return lax.switch(n // rounds, branches, total)
+        return lax.switch(n // more, branches, total)
 
-    return lax.fori_loop(0, len(adds) * rounds, step, start)
+    total = _over_rows(records, adds[0], total)
+    total = lax.fori_loop(0, len(adds) * more, step, total)
+    return _over_rows(records, adds[1], total) if len(adds) > 1 else total
 
 
 def _push(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array, added: Array
+    view: View,
+    method: Method,
+    records: Records,
+    rims: Array,
+    points: Array,
+    colors: Array,
+    added: Array,
 ) -> Array:
     """Change of the image with the homogeneous pixel coordinates and with the hard image.
 
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
     at the next pixel inwards stands for it.
     """
-    rim = blended.rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
+    rim = rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
 
     def average(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
         averages, added = total
@@ -86,58 +93,58 @@ def _push(
 
     adds = [add] if method.shader is None else [average, add]
     start = jnp.zeros_like(colors), added
-    averages, added = _over_pieces(view, method, blended.records, adds, start)
+    averages, added = _over_pieces(view, method, records, adds, start)
     return added + cropped(jnp.where(rim[:, None], averages, colors), view.image.shape)
 
 
 def _pull(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array, cotangent: Array
+    view: View, method: Method, records: Records, rims: Array, cotangent: Array
 ) -> tuple[Array, Array]:
-    """The transpose of `_push`, added to `points` and `colors`."""
-    rim = blended.rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, blended.rims, 1)
+    """The transpose of `_push`: what a change of the image means for `points` and `colors`."""
+    rim = rims > 0
+    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
     own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
-    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(colors.shape)
+    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(rim.size, -1)
 
     def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, colors = total
+        points, own, inwards = total
         integers, jump, weights, motion = rows
         pixel, front, beyond, _, start, end = integers.T
         value = jnp.where(used[:, None], cotangent[pixel], 0)
         along = jnp.sum(value * jump, axis=1)[:, None]
         points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
         value = value * weights[:, :1]
-        return points, own.at[beyond].add(value).at[front].add(-value), colors
+        return points, own.at[beyond].add(value).at[front].add(-value), inwards
 
     def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, colors = total
+        points, own, inwards = total
         integers, _, weights, _ = rows
         _, front, _, inner, _, _ = integers.T
         share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return points, own, colors.at[inner].add(share[:, None] * own[front])
+        return points, own, inwards.at[inner].add(share[:, None] * own[front])
 
     adds = [add] if method.shader is None else [add, average]
-    start = points, own, colors
-    points, own, colors = _over_pieces(view, method, blended.records, adds, start)
-    return points, colors + jnp.where(rim[:, None], 0, own)
+    points = linear_zeros((view.positions_clip.shape[0], 3), cotangent)
+    start = points, own, linear_zeros(own.shape, cotangent)
+    points, own, inwards = _over_pieces(view, method, records, adds, start)
+    return points, inwards + jnp.where(rim[:, None], 0, own)
 
 
 def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
-    """Zeros that depend on a tangent.
-
-    The system below has to depend on all parts of its right side, and what comes out on all parts
-    of its solution: derivatives of it and of its transpose, again, leave out none.
-    """
+    """Zeros that depend on a tangent: derivatives leave out what is known not to."""
     return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
 
 
 def apply_linear(
-    view: View, method: Method, blended: Blended, points: Array, colors: Array
+    view: View, method: Method, records: Records, rims: Array, points: Array, colors: Array
 ) -> Array:
     """`_push`, written as a linear system so that JAX knows both directions.
 
     The system is triangular, (points, colors, out - push) = (points, colors, 0), and its solution
-    and that of its transpose are loops over as many pieces as there are.
+    and that of its transpose are loops over as many pieces as there are. The transpose's right side
+    is zero but for the image, since nothing else of the solution is used. It has to depend on all
+    parts of its right side, and what comes out on all parts of its solution, if only by one number
+    each: derivatives of it and of its transpose, again, leave out none.
     """
     one_by_one = jax.custom_batching.sequential_vmap
 
@@ -146,13 +153,13 @@ def apply_linear(
 
     def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         push = one_by_one(lambda view, *rest: _push(view, method, *rest))
-        return b[0], b[1], push(view, blended, *b)
+        return b[0], b[1], push(view, records, rims, *b)
 
     def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         pull = one_by_one(lambda view, *rest: _pull(view, method, *rest))
-        return *pull(view, blended, *b), b[2]
+        return *pull(view, records, rims, b[2]), b[2]
 
-    nothing = linear_zeros(cropped(colors, view.image.shape).shape, colors)
+    nothing = jnp.zeros_like(cropped(colors, view.image.shape)).at[0, 0].add(0 * points[0, 0])
     right = points, colors, nothing
     points, colors, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
-    return out + linear_zeros(out.shape, points) + linear_zeros(out.shape, colors)
+    return out.at[0, 0].add(0 * points[0, 0] + 0 * colors[0, 0])
