@@ -26,7 +26,7 @@ from diffrast.shadows import Reached
 
 RUN = 32  # pixels
 RUNS_AT_ONCE = 512
-LARGE = 1 << 17  # pixels: what smaller images need is fast to store
+LARGE = 90_000  # pixels: what smaller images need is fast to store
 VERY_LARGE = 5 << 16  # pixels: the same without a derivative
 
 

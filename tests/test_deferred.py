@@ -34,7 +34,7 @@ def shade(color, points, reached):
 
 
 def colors(params):
-    """Of an image whose pixels are shaded in batches if `deferred.LARGE` is small."""
+    """Of an image whose pixels are shaded in batches if the limits of `deferred` are small."""
     eye = params["eye"]
     camera = dr.Camera.perspective(
         eye=eye, target=(0, 0, 0), up=(0, 1, 0), fov_y=0.7, near=0.1, far=10
@@ -93,7 +93,10 @@ def test_batches_under_shard_map_of_vmap_of_grad(whole, small_batches):
     np.testing.assert_allclose(got, [wanted] * 2, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
 
-def test_images_under_shard_map(whole, small_batches):
+@pytest.mark.parametrize("without_derivative", ["in batches", "in one go"])
+def test_images_under_shard_map(whole, small_batches, monkeypatch, without_derivative):
+    if without_derivative == "in batches":
+        monkeypatch.setattr(deferred, "VERY_LARGE", 0)
     devices = jax.make_mesh((1,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
 
     def of_views(eyes):

@@ -12,7 +12,16 @@ import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.blend import Method, View, collect
 from diffrast.edges.derivative import apply_linear
-from diffrast.edges.pieces import clip_edges, facing, to_pixels
+from diffrast.edges.pieces import (
+    CUT_AT_ONCE,
+    PIECES_AT_ONCE,
+    Pieces,
+    Waiting,
+    clip_edges,
+    facing,
+    first_ones,
+    to_pixels,
+)
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -209,6 +218,24 @@ def test_no_piece_is_lost_however_few_records_there_are(seen):
     assert 300 < many[0] == few[0]
     for a, b in zip(jax.tree.leaves(many[1:]), jax.tree.leaves(few[1:]), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_few_pieces_are_looked_at_in_parts():
+    """Which follow each other to the bit, as pieces have to that add up to an outline's area."""
+    ranges = np.float32([[0.1, 0.25, 0.7], [0.2, 0.6, 0.75]])
+    number = jnp.arange(PIECES_AT_ONCE + CUT_AT_ONCE)
+    places = jnp.minimum(number, 2)
+    pieces = Pieces(places, jnp.stack([number, number]), jnp.asarray(ranges)[:, places], number < 0)
+    few = first_ones(Waiting(pieces, jnp.int32(3)))
+    count = int(few.exists.sum())
+    begin, end = np.asarray(few.range)[:, :count].reshape(2, 3, -1)
+    assert begin.shape[1] > 1
+    assert np.all(begin < end)
+    assert np.array_equal(begin[:, 1:], end[:, :-1])
+    assert np.array_equal([begin[:, 0], end[:, -1]], ranges)
+    assert np.array_equal(few.segment[:count], np.repeat(np.arange(3), begin.shape[1]))
+    many = first_ones(Waiting(pieces, number[-1]))
+    assert np.array_equal(many.range, pieces.range[:, :PIECES_AT_ONCE])
 
 
 def test_topology_is_the_same_whether_traced_or_not():

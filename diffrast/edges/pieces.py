@@ -22,9 +22,11 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.edges.planes import FINE_TOLERANCE, cross_rows, largest, nearest_first
 
-EDGES_AT_ONCE = 512
+EDGES_AT_ONCE = 4096
 CUT_AT_ONCE = 1024
 PIECES_AT_ONCE = 512
+FEW = 32  # pieces, which are looked at
+PARTS = 16  # in so many parts
 _EDGE_ON = 8  # roundings in the volume of a face
 
 
@@ -269,9 +271,19 @@ def behind(waiting: Waiting, pieces: Pieces, count: Array) -> Waiting:
 
 
 def first_ones(waiting: Waiting) -> Pieces:
-    """As many as are looked at at once."""
-    pieces = jax.tree.map(lambda column: column[..., :PIECES_AT_ONCE], waiting.pieces)
-    return pieces._replace(exists=jnp.arange(PIECES_AT_ONCE) < waiting.total)
+    """As many as are looked at at once; in parts, each of them, if these are few.
+
+    What hides a piece here and there is found one part after the other.
+    """
+    parts = jnp.where(waiting.total <= FEW, PARTS, 1)
+    number = jnp.arange(PIECES_AT_ONCE)
+    piece, part = number // parts, number % parts
+    segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
+    begin, end = range_
+    length = (end - begin) / parts
+    last = jnp.where(part == parts - 1, end, begin + (part + 1) * length)
+    range_ = stored(jnp.stack([begin + part * length, last]))
+    return Pieces(segment, pixel, range_, piece < waiting.total)
 
 
 def instead_of_first(waiting: Waiting, pieces: Pieces) -> Waiting:
