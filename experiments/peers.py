@@ -30,7 +30,7 @@ class Deodr(Peer):
             from deodr.differentiable_renderer import Camera, Scene3D
             from deodr.triangulated_mesh import ColoredTriMesh
         except ImportError as error:
-            raise MissingPeerError("DEODR needs deodr: install diffrast[peers]") from error
+            raise MissingPeerError(f"install diffrast[peers] for DEODR: {error}") from error
 
         class PoseCamera(Camera):
             """Keeps the derivative by the points in its own system.
@@ -99,7 +99,7 @@ class Mitsuba(Peer):
             mitsuba.set_variant("llvm_ad_rgb")
         except ImportError as error:
             raise MissingPeerError(
-                "Mitsuba needs mitsuba and LLVM: install diffrast[peers]"
+                f"install diffrast[peers] and an LLVM library for Mitsuba: {error}"
             ) from error
         self.drjit, self.mitsuba = drjit, mitsuba
         faces = np.asarray(task.mesh.faces)
