@@ -78,14 +78,13 @@ def shade_covered(
 
     @jax.custom_jvp
     def colors(inputs: _Inputs) -> Columns:
-        def in_one_go(inputs: _Inputs) -> Columns:
+        def shaded(inputs: _Inputs) -> Columns:
+            way = _in_batches if face.size > VERY_LARGE else _in_one_go
             zero = varying_zero(inputs)
-            return [c + zero.astype(c.dtype) for c in _in_one_go(shade, inputs)]
+            return [c + zero.astype(c.dtype) for c in way(shade, inputs)]
 
-        if face.size > VERY_LARGE:
-            return _in_batches(shade, inputs)
         seen = jnp.max(inputs.face) >= 0
-        return lax.cond(seen, in_one_go, _background_alone, inputs)
+        return lax.cond(seen, shaded, _background_alone, inputs)
 
     def derivative(primals: Any, tangents: Any) -> tuple[Columns, Columns]:
         leaves, tree = jax.tree.flatten(primals[0])
@@ -122,25 +121,25 @@ def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
 
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     data, drawn, face, reached, _ = inputs
-    runs, faces = _covered_runs(face), _in_runs(face, -1)
+    runs, seen = _covered_runs(face), _in_runs(face, -1)
     parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
-    data, drawn, faces, parts, runs = varying_alike((data, drawn, faces, parts, runs))
+    data, drawn, seen, parts, runs = varying_alike((data, drawn, seen, parts, runs))
     dtype = drawn.positions_clip.dtype
 
-    def pixels_of(runs: Array) -> Pixels:
-        number = runs[..., None] * RUN + jnp.arange(RUN)
-        number = number.reshape(*runs.shape[:-1], -1)
-        seen = faces.at[runs].get(mode="fill", fill_value=-1).reshape(number.shape)
-        return pixels_at(seen, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
+    def pixels_of(chosen: Array) -> Pixels:
+        number = chosen[..., None] * RUN + jnp.arange(RUN)
+        number = number.reshape(*chosen.shape[:-1], -1)
+        own = seen.at[chosen].get(mode="fill", fill_value=-1).reshape(number.shape)
+        return pixels_at(own, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
 
     chosen = runs.chosen.reshape(-1, RUNS_AT_ONCE)
     carried = carry(drawn, pixels_of(chosen)) if many else None
 
     def shade_batch(batch: Any) -> Columns:
-        _, runs, carried, reached = batch
-        return shade(data, points_at(drawn, pixels_of(runs), carried), reached)
+        _, chosen, carried, reached = batch
+        return shade(data, points_at(drawn, pixels_of(chosen), carried), reached)
 
     def no_colors(batch: Any) -> Columns:
         return [jnp.zeros(RUNS_AT_ONCE * RUN, dtype) + 0 * runs.total] * 3
