@@ -41,12 +41,12 @@ from diffrast.edges.pieces import (
     to_pixels,
 )
 from diffrast.edges.piercing import (
+    LINES_AT_ONCE,
     PIXELS_AT_ONCE,
     Line,
     choose_pixels,
     cross,
-    keep_near_crossings,
-    line_of,
+    lines_of,
 )
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
@@ -220,19 +220,16 @@ def _add_piercing(
     """Add the lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
-    order, count = keep_near_crossings(
-        *choose_pixels(view.face_image, bodies), view.faces, pixels, bodies, view.face_image
-    )
+    order, count = choose_pixels(view.face_image, bodies)
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
-        pixel = jnp.stack([number % width, number // width])
+        pixel = stored(jnp.stack([number % width, number // width]))
         crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
 
-        def add_lines(n: Array, total: Blended) -> Blended:
-            return _with_line(total, view, method, pixel, line_of(crossings, n, pixel), first)
+        def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
+            return _with_line(total, view, method, lines_of(crossings, pair, exists), first)
 
-        most = jnp.max(jnp.sum(crossings.exists, axis=0))
-        return lax.fori_loop(0, most, add_lines, total)
+        return over_batches(crossings.pairs, crossings.total, LINES_AT_ONCE, add_lines, total)
 
     return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
 
@@ -360,11 +357,11 @@ def _with_pieces(
 
 
 def _with_line(
-    total: Blended, view: View, method: Method, pixel: Array, line: Line, first: Array | None
+    total: Blended, view: View, method: Method, line: Line, first: Array | None
 ) -> Blended:
-    """Add one line in each pixel where surfaces pierce each other."""
+    """Add lines where surfaces pierce each other."""
     area = _area(line.begin, line.end)
-    places = [_place(view, pixel, look) for look in line.look]
+    places = [_place(view, line.pixel, look) for look in line.look]
     if method.shader is None:
         right, left = (view.image.reshape(-1, view.image.shape[2])[i] for i in places)
     else:
@@ -373,7 +370,7 @@ def _with_line(
     jump = stored(right - left)
     value = area[:, None] * jump
     held = jnp.stack([right, left])
-    sums, own = _with_values(total.sums, view, pixel, line.used, value, held)
+    sums, own = _with_values(total.sums, view, line.pixel, line.used, value, held)
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
     use = jnp.stack([line.used] * 3)

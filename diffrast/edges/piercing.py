@@ -11,31 +11,27 @@ and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, a
 corner; so where a corner moves by dV, 1/w changes at a fixed point by −λ c · dV.
 """
 
-import itertools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._selection import over_batches, prefix_sum, selected
+from diffrast._selection import selected
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import TOLERANCE, Table, corners_of, edge_values
+from diffrast.edges.planes import TOLERANCE, Table, corners_of
 
-PIXELS_AT_ONCE = 64
-_TESTED_AT_ONCE = 512
-_WINDOW = 3.0  # pixels from the centre
+PIXELS_AT_ONCE = 512
+LINES_AT_ONCE = 128
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
-
 _FACES = 9 + 2 * 3
-# Of 32 bits: JAX refuses others where they were used before in a different precision.
-_ONE, _OTHER = np.array(list(itertools.combinations(range(_FACES), 2)), np.int32).T
 
 
 class _Planes(NamedTuple):
@@ -48,17 +44,19 @@ class _Planes(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """Lines that may part pixels: one for each pair of faces, shape (pairs, n)."""
+    """Pairs of faces that may pierce each other within pixels."""
 
+    pixel: Int[Array, "2 n"]
     planes: _Planes
     unit: Float[Array, " n"]  # of 1/w
-    exists: Bool[Array, "pairs n"]
-    range: tuple[Array, Array]  # begin and end along the line, from its point next to the centre
+    pairs: Int[Array, " list"]  # (one row * rows + other row) * n + number of the pixel
+    total: Int[Array, ""]  # of pairs
 
 
 class Line(NamedTuple):
-    """One line in each of n pixels."""
+    """Lines, one in each of n pixels."""
 
+    pixel: Int[Array, "2 n"]
     used: Bool[Array, " n"]
     look: Int[Array, "2 n"]  # 0 to 8: pixels that show the face in front on the right and left
     face: Int[Array, "2 n"]  # these faces,
@@ -81,39 +79,6 @@ def choose_pixels(
     return selected((largest > least).reshape(-1))
 
 
-def keep_near_crossings(
-    order: Int[Array, " pixels"],
-    count: Int[Array, ""],
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    bodies: Int[Array, " F"],
-    face_image: Int[Array, "height_with_border width_with_border"],
-) -> tuple[Int[Array, " pixels"], Int[Array, ""]]:
-    """Of chosen pixels those round which the planes of two bodies' faces change places."""
-    width = face_image.shape[1] - 2
-
-    def add(number: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        kept, total = state
-        row, column = number // width, number % width
-        face = stored(pixels_round(face_image, column, row))
-        body = stored(jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1))
-        corner = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])[:, None, :, None] * _WINDOW
-        x, y = jnp.stack([column, row])[:, None, None] + 0.5 + corner
-        _, depth = edge_values(corners_of(face, faces, pixels)[:, :, :, None], x, y)
-        one, other = np.array(list(itertools.combinations(range(9), 2))).T
-        apart = stored(depth)[one] - depth[other]
-        unknown = jnp.any(depth == -1, axis=1)
-        changes = ~(jnp.all(apart > 0, axis=1) | jnp.all(apart < 0, axis=1))
-        differ = (body[one] >= 0) & (body[other] >= 0) & (body[one] != body[other])
-        changes = jnp.any(differ & (changes | unknown[one] | unknown[other]), axis=0)
-        keep = exists & changes
-        ends = prefix_sum(keep.astype(jnp.int32))
-        slot = jnp.where(keep, total + ends - 1, order.shape[0])
-        return kept.at[slot].set(number, mode="drop"), total + ends[-1]
-
-    return over_batches(order, count, _TESTED_AT_ONCE, add, (order, count & 0))
-
-
 def _two_bodies(body: Array) -> tuple[Array, Array]:
     """Rows of the first one that is there, and of the first other."""
     last = body.shape[0] - 1
@@ -131,36 +96,22 @@ def cross(
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Crossings:
-    """Find where faces near pixels (column, row) pierce each other, seen or not."""
+    """Find which faces near pixels (column, row) may pierce each other there, seen or not.
+
+    Those that reach into the pixel, and whose planes meet within it.
+    """
     assert topology.bodies is not None
     face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, volume, face_image)
     planes, unit = _planes(pixel, face, look, faces, pixels)
-    sums = stored(jnp.sum(planes.lambdas, axis=1))
-    point, normal, inverse = stored(_line(sums[:, _ONE] - sums[:, _OTHER]))
-    along = _REACH * _left_of(normal)
-    both = planes.lambdas[:, :, np.stack([_ONE, _OTHER])]  # (3, 3 corners, 2 faces, pairs, n)
-
-    def inside(x: Array, y: Array) -> Array:
-        square = jnp.stack([0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y])
-        on_faces = both[0] + x * both[1] + y * both[2]
-        return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
-
-    ends = [inside(*(point + r * along)) for r in (-1, 1)]
-    low, high = positive_part(*map(list, ends))
-    begin, end = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
-
-    # Both reach to both sides.
-    x, y = stored(point + (begin + end) / (2 * _REACH) * along)
-    slope = abs(both[1] * normal[0] + both[2] * normal[1])
-    least = both[0] + x * both[1] + y * both[2] - _THROUGH * slope
-    through = jnp.min(least, axis=(0, 1)) > 0
-    # Faces that lie on one another differ by rounding, and have no line.
-    largest = jnp.max(abs(planes.lambdas), axis=(0, 1))
-    rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[_ONE] + largest[_OTHER])
-    steep = inverse * rounding < 1
-    differ = (body[_ONE] != body[_OTHER]) & planes.known[_ONE] & planes.known[_OTHER]
-    exists = exists & differ & steep & (low < high) & through
-    return Crossings(planes, unit, exists, (begin, end))
+    value, *slopes = planes.lambdas
+    reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
+    near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
+    body = stored(jnp.where(near, body, -1))
+    value, across, down = (part[:, None] - part for part in stored(jnp.sum(planes.lambdas, axis=1)))
+    meet = abs(value) <= 0.5 * (abs(across) + abs(down))
+    differ = (body[:, None] != body) & (body[:, None] >= 0) & (body >= 0)
+    once = np.tri(_FACES, k=-1, dtype=bool).T[..., None]
+    return Crossings(pixel, planes, unit, *selected((once & differ & meet).reshape(-1)))
 
 
 def _candidates(
@@ -229,41 +180,58 @@ def _left_of(normal: Array) -> Array:
     return jnp.stack([-normal[1], normal[0]])
 
 
-def line_of(crossings: Crossings, number: Array, pixel: Int[Array, "2 n"]) -> Line:
-    """The line with this number, 0 and up, in each pixel, if it is visible."""
-    rank = jnp.cumsum(crossings.exists, axis=0) - 1
-    here = crossings.exists & (rank == number)
-    pair = stored(jnp.argmax(here, axis=0))
-    which = stored(jnp.stack([jnp.asarray(_ONE)[pair], jnp.asarray(_OTHER)[pair]]))
+def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, " n"]) -> Line:
+    """The lines along which these pairs of faces pierce each other, where they are visible."""
+    at_once = crossings.unit.size
+    one, other, place = pair // at_once // _FACES, pair // at_once % _FACES, pair % at_once
+    pixel, planes = stored(
+        jax.tree.map(lambda part: part[..., place], (crossings.pixel, crossings.planes))
+    )
+    which = jnp.stack([one, other])
 
     def both(values: Array) -> Array:
-        return stored(jnp.stack([picked(values, which[0]), picked(values, which[1])]))
+        return stored(jnp.stack([picked(values, one), picked(values, other)]))
 
-    planes = crossings.planes
     at = jnp.take_along_axis(planes.lambdas, which[None, None], axis=2, mode="promise_in_bounds")
-    at = stored(at)
+    at = stored(at)  # (3, 3 corners, 2 faces, n)
     sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
-    point, normal, inverse = _line(sums[:, 0] - sums[:, 1])
+    point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))
     along = _left_of(normal)
-    first, last = (picked(part, pair) for part in crossings.range)
+
+    def inside(x: Array, y: Array) -> Array:
+        square = jnp.stack([0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y])
+        on_faces = at[0] + x * at[1] + y * at[2]
+        return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
+
+    low, high = positive_part(*(list(inside(*(point + r * along))) for r in (-_REACH, _REACH)))
+    first, last = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
     begin, end = point + first * along, point + last * along
-    x, y = (begin + end) / 2
-    inside = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)
-    depth = jnp.sum(inside, axis=0)
-    used = jnp.any(here, axis=0) & ~_hidden(planes, x, y, depth[0])
+    x, y = stored((begin + end) / 2)
+    values = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)
+    depth = jnp.sum(values, axis=0)
+
+    # Both reach to both sides.
+    slope = abs(at[1] * normal[0] + at[2] * normal[1])
+    through = jnp.min(values - _THROUGH * slope, axis=(0, 1)) > 0
+    # Faces that lie on one another differ by rounding, and have no line.
+    largest = jnp.max(abs(at), axis=(0, 1))
+    rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[0] + largest[1])
+    used = exists & (inverse * rounding < 1) & (low < high) & through
+    used = used & ~_hidden(planes, x, y, depth[0])
 
     centre = pixel + 0.5
     plane = jnp.stack(
         [sums[1], sums[2], depth - (x + centre[0]) * sums[1] - (y + centre[1]) * sums[2]]
     )
     # λ is in units of 1/w, and so are the planes and the slope that divides them.
-    factor = (last - first) * inverse / crossings.unit * jnp.array([[-1], [1]])
-    motion = inside[:, None] * (factor * plane)[None]
+    factor = (last - first) * inverse / crossings.unit[place] * jnp.array([[-1], [1]])
+    motion = values[:, None] * (factor * plane)[None]
     return Line(
+        pixel=pixel,
         used=used,
         look=both(planes.look),
         face=both(planes.face),
-        barycentrics=[value / jnp.where(depth > 0, depth, 1) for value in inside],
+        barycentrics=[value / jnp.where(depth > 0, depth, 1) for value in values],
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
