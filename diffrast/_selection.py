@@ -71,8 +71,9 @@ def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, "
         more, added = compacted(chosen.reshape(-1), number.reshape(-1))
         return lax.dynamic_update_slice(indices, more, (total,)), total + added
 
-    # The start is made from the data so that, under `shard_map`, it varies like them.
-    zero = block_count & 0
+    # The start is made from the data so that, under `shard_map`, it varies like them, and so that
+    # it is not made, and held, before they are there.
+    zero = stored(block_count & 0, block_count)
     room = mask.size + _BLOCK * _BLOCKS_AT_ONCE
     indices = jnp.zeros(room, jnp.int32) + zero
     return over_batches(block_list, block_count, _BLOCKS_AT_ONCE, add, (indices, zero))

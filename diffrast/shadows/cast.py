@@ -116,7 +116,8 @@ def _regards(
     visible = jnp.maximum(points.face, 0)
     regards = []
     for light, view, outside in zip(lights, views, turned, strict=True):
-        seen = stored(see(light, view, position))
+        # By the position: what is the same for all points is not made, and held, before that.
+        seen = stored(see(light, view, position), position[0])
         regards.append(_Regard(seen, seen.inside & outside[visible] & (points.face >= 0)))
     return regards
 

@@ -116,7 +116,7 @@ def _between_pixels(
         place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
-    none = jnp.full(pairs.size, -1, jnp.int32) + (count & 0)
+    none = jnp.full(pairs.size, -1, jnp.int32) + stored(count & 0, count)
     return over_batches(order, count, _AT_ONCE, look, none).reshape(pairs.shape)
 
 
