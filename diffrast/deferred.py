@@ -4,8 +4,9 @@ A picture alone is shaded in one go, a large one only if it shows a face. With i
 are hundreds of values for each pixel between faces and colours, more than memory can pass along in
 good time: so the image is cut into runs of pixels, runs without a face are left out, and the others
 are shaded in batches that stay in cache. A reverse pass goes through the batches again and begins
-by repeating each. Very large pictures are shaded so without a derivative, too: temporary memory of
-more than 32 MB is given back after each call, and a new one costs more than the shading.
+by repeating each. Very large pictures, and large ones with shadows, are shaded so without a
+derivative, too: temporary memory of more than 32 MB is given back after each call, and a new one
+costs more than the shading.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from diffrast.shadows import Reached
 RUN = 32  # pixels
 RUNS_AT_ONCE = 512
 LARGE = 90_000  # pixels: what smaller images need is fast to store
-VERY_LARGE = 200_000  # pixels: the same without a derivative
+VERY_LARGE = 5 << 16  # pixels: the same without a derivative or shadows
 
 
 class _Runs(NamedTuple):
@@ -71,16 +72,17 @@ def shade_covered(
         face: that each pixel sees, -1 for none.
         reached: by each light; images.
         background: numbers or images.
-        in_batches: whether very large images and derivatives of large ones are.
+        in_batches: whether large images, or their derivatives, may be.
     """
     inputs = _Inputs(data, drawn, face, reached, background)
     if not in_batches or face.size <= LARGE:
         return _in_one_go(shade, inputs)
+    has_shadows = any(part is not None for part in reached)
 
     @jax.custom_jvp
     def colors(inputs: _Inputs) -> Columns:
         def shaded(inputs: _Inputs) -> Columns:
-            way = _in_batches if face.size > VERY_LARGE else _in_one_go
+            way = _in_batches if has_shadows or face.size > VERY_LARGE else _in_one_go
             zero = varying_zero(inputs)
             return [c + zero.astype(c.dtype) for c in way(shade, inputs)]
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from diffrast._stored import stored_rows
+from diffrast._stored import stored, stored_rows
 from diffrast._topology import Edges, Topology, traced_topology
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.interpolate import interpolate_columns
@@ -152,7 +152,9 @@ def visible_points(drawn: Drawn, face: Array) -> Points:
 def at_points(attribute: Array, geometry: Geometry, points: Points) -> Columns:
     """Values at the vertices, (V, C), interpolated at points."""
     columns = [attribute[:, i] for i in range(attribute.shape[1])]
-    return interpolate_columns(columns, geometry.faces, points.face, points.barycentrics)
+    # Not before the barycentrics are found: what these are made of need not be kept meanwhile.
+    face = stored(points.face, points.barycentrics[0])
+    return interpolate_columns(columns, geometry.faces, face, points.barycentrics)
 
 
 def positions_at(geometry: Geometry, points: Points) -> Columns:

@@ -116,7 +116,8 @@ def render(
         border=border,
     )
     with jax.named_scope("shade"):
-        pixels = visible_points(jax.lax.stop_gradient(drawn), face)  # if there are shadows
+        bare = jax.lax.stop_gradient(drawn._replace(attributes=(), projection=None))
+        pixels = visible_points(bare, face)  # if there are shadows
         world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
         world = world._replace(paints=paint_scene(scene, geometry, clip, height, width))
         # Others look at all vertices or texels for each batch.

@@ -160,6 +160,10 @@ def test_a_derivative_is_not_traced_again_for_other_values():
 def test_temporary_memory_is_not_mapped_anew_at_each_call():
     """More than 32 MB are given back after each call, and the next one maps every page again."""
     options = dr.RenderSettings(height=512, width=512)
-    program, arguments = gradient(scene(), "camera", options)
-    memory = program.lower(*arguments).compile().memory_analysis()
-    assert 1 << 20 < memory.temp_size_in_bytes < 32 << 20
+    shadowed = scene(light=dataclasses.replace(SUN, shadow=dr.Shadow(resolution=512)))
+    for program, arguments in (
+        gradient(scene(), "camera", options),
+        (jax.jit(dr.render), (shadowed, CAMERA, options)),
+    ):
+        memory = program.lower(*arguments).compile().memory_analysis()
+        assert 1 << 20 < memory.temp_size_in_bytes < 32 << 20

@@ -204,10 +204,8 @@ def _see(drawn: Drawn, pixels: Pixels) -> _Seen:
 
 def _at_corners(drawn: Drawn, seen: _Seen) -> list[list[Columns]]:
     """For each attribute, for each of its columns, the values at the three corners."""
-    # Not before the barycentrics are found: what these are made of need not be kept meanwhile.
-    corners = [stored(*both) for both in zip(seen.corners, seen.barycentrics, strict=True)]
     return [
-        [[values[:, c][corner] for corner in corners] for c in range(values.shape[1])]
+        [[values[:, c][corner] for corner in seen.corners] for c in range(values.shape[1])]
         for values in drawn.attributes
     ]
 
