@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
-from diffrast._stored import stored
+from diffrast._stored import stored, zero_after
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -71,9 +71,7 @@ def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, "
         more, added = compacted(chosen.reshape(-1), number.reshape(-1))
         return lax.dynamic_update_slice(indices, more, (total,)), total + added
 
-    # The start is made from the data so that, under `shard_map`, it varies like them, and so that
-    # it is not made, and held, before they are there.
-    zero = stored(block_count & 0, block_count)
+    zero = zero_after(block_count)
     room = mask.size + _BLOCK * _BLOCKS_AT_ONCE
     indices = jnp.zeros(room, jnp.int32) + zero
     return over_batches(block_list, block_count, _BLOCKS_AT_ONCE, add, (indices, zero))

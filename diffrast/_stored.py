@@ -34,6 +34,14 @@ def stored(values: T, witness: Array | None = None) -> T:
     return jax.tree.map(store, values)
 
 
+def zero_after(witness: Array) -> Array:
+    """A zero like a number: what is made of it is not made, and held, before that number is there.
+
+    Under `shard_map` it varies as the number does.
+    """
+    return stored(jnp.zeros((), witness.dtype), witness)
+
+
 @jax.custom_jvp
 def stored_alone(value: Array) -> Array:
     """Store an array, and leave its derivative to whatever takes it: no pass over it is added."""

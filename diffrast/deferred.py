@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Int
 
 from diffrast._selection import compacted
-from diffrast._stored import stored
+from diffrast._stored import zero_after
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
@@ -178,10 +178,8 @@ def _taken(in_runs: Array, runs: _Runs) -> Array:
 
 def _put_back(values: Array, runs: _Runs, shape: tuple[int, ...]) -> Array:
     size = shape[0] * shape[1]
-    # Made of the values: else what they are added to would be made, and held, before these are. The
-    # transpose of an addition is a gather, which needs no zeros to begin with.
-    zero = stored(jnp.zeros((), values.dtype), values[0, 0])
-    rows = jnp.zeros((-(-size // RUN), RUN), values.dtype) + zero
+    rows = jnp.zeros((-(-size // RUN), RUN), values.dtype) + zero_after(values[0, 0])
+    # The transpose of an addition is a gather, which needs no zeros to begin with.
     rows = rows.at[runs.chosen].add(
         values.reshape(-1, RUN), mode="drop", indices_are_sorted=True, unique_indices=True
     )

@@ -49,6 +49,7 @@ from diffrast.edges.piercing import (
     lines_of,
 )
 from diffrast.edges.rim import BESIDE
+from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
 from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look, uncovered
@@ -257,7 +258,7 @@ def _add_shadows(
         most = jnp.max(jnp.sum(outlines.exists, axis=0))
         return lax.fori_loop(0, most, add_lines, total)
 
-    return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
+    return over_batches(order, count, SHADOWED_AT_ONCE, add_pixels, total)
 
 
 def _nothing(view: View, method: Method, first: Array | None, zero: Array) -> Blended:

@@ -187,12 +187,12 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     pixel, planes = stored(
         jax.tree.map(lambda part: part[..., place], (crossings.pixel, crossings.planes))
     )
-    which = jnp.stack([one, other])
 
     def both(values: Array) -> Array:
         return stored(jnp.stack([picked(values, one), picked(values, other)]))
 
-    at = jnp.take_along_axis(planes.lambdas, which[None, None], axis=2, mode="promise_in_bounds")
+    which = jnp.stack([one, other])[None, None]
+    at = jnp.take_along_axis(planes.lambdas, which, axis=2, mode="promise_in_bounds")
     at = stored(at)  # (3, 3 corners, 2 faces, n)
     sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
     point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))

@@ -27,6 +27,7 @@ from diffrast.edges.neighborhood import first_row
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import Columns, Table, barycentrics, cross_rows, edge_functions
 
+PIXELS_AT_ONCE = 512
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow

@@ -17,7 +17,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import over_batches, selected
-from diffrast._stored import stored
+from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
 from diffrast.edges.planes import edge_functions
@@ -116,7 +116,7 @@ def _between_pixels(
         place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
-    none = jnp.full(pairs.size, -1, jnp.int32) + stored(count & 0, count)
+    none = jnp.full(pairs.size, -1, jnp.int32) + zero_after(count)
     return over_batches(order, count, _AT_ONCE, look, none).reshape(pairs.shape)
 
 
