@@ -77,20 +77,38 @@ def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, "
     return over_batches(block_list, block_count, _BLOCKS_AT_ONCE, add, (indices, zero))
 
 
+def batches_of(count: Int[Array, ""], at_once: int) -> Int[Array, ""]:
+    """How many batches so many make."""
+    return (count + at_once - 1) // at_once
+
+
 def over_batches(
     order: Int[Array, " n"],
     count: Int[Array, ""],
     at_once: int,
     add: Callable[[Int[Array, " some"], Bool[Array, " some"], T], T],
     start: T,
+    *,
+    first: Array | int = 0,
+    goes_on: Callable[[T], Bool[Array, ""]] | None = None,
 ) -> T:
-    """Fold `add(indices, exists, total)` over the first `count` of `order`, so many at a time."""
+    """Fold `add(indices, exists, total)` over the first `count` of `order`, so many at a time.
 
-    def step(n: Array, total: T) -> T:
+    From the batch `first` on, and only while `goes_on(total)`.
+    """
+    batches = batches_of(count, at_once)
+
+    def step(state: tuple[Array, T]) -> tuple[Array, T]:
+        n, total = state
         slots = n * at_once + jnp.arange(at_once)
-        return add(stored(order[jnp.minimum(slots, order.shape[0] - 1)]), slots < count, total)
+        indices = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
+        return n + 1, add(indices, slots < count, total)
 
-    return lax.fori_loop(0, (count + at_once - 1) // at_once, step, start)
+    def is_left(state: tuple[Array, T]) -> Array:
+        left = state[0] < batches
+        return left if goes_on is None else left & goes_on(state[1])
+
+    return lax.while_loop(is_left, step, (jnp.asarray(first), start))[1]
 
 
 def work_off(

@@ -49,6 +49,7 @@ ORDER = [
     "diffrast.edges.visibility",
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_lines",
+    "diffrast.edges.records",
     "diffrast.edges.blend",
     "diffrast.edges.derivative",
     "diffrast.edges.antialias",

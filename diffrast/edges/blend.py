@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._selection import over_batches, prefix_sum
+from diffrast._selection import batches_of, over_batches, prefix_sum
 from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import blocks_with_background
@@ -47,6 +47,15 @@ from diffrast.edges.piercing import (
     choose_pixels,
     cross,
     lines_of,
+)
+from diffrast.edges.records import (
+    Records,
+    Start,
+    after_batch,
+    has_room,
+    no_records,
+    with_lines,
+    with_rows,
 )
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
@@ -93,16 +102,6 @@ class Method(NamedTuple):
     capacity: int
 
 
-class Records(NamedTuple):
-    """Visible pieces, as many as there are rows; the first `total` are in use, or all."""
-
-    total: Int[Array, ""]  # number of visible pieces
-    integers: Int[Array, "capacity 6"]  # pixel, pixels of front, beyond, rim; two vertices
-    jump: Float[Array, "capacity channels"]  # of the colour outwards, as the piece moves
-    weights: Float[Array, "capacity 2"]  # area beyond as the pixel's centre sees it; rim's length
-    motion: Float[Array, "capacity 6"]  # of the area with x, y, w of the two vertices
-
-
 class Sums(NamedTuple):
     """What the pieces do to the picture."""
 
@@ -112,10 +111,22 @@ class Sums(NamedTuple):
 
 
 class Blended(NamedTuple):
-    """The pieces, and what they add up to; None where only more records are asked for."""
+    """The pieces, and what they add up to; None where only records are asked for."""
 
     records: Records
     sums: Sums | None
+
+
+Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
+
+
+class Work(NamedTuple):
+    """Edges or pixels where there may be pieces: `add(indices, exists, total)` for all batches."""
+
+    order: Int[Array, " list"]
+    size: Int[Array, ""]  # of those on the list
+    at_once: int
+    add: Add
 
 
 def perimeter(x: Array, y: Array) -> Array:
@@ -150,19 +161,56 @@ def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
     return jnp.stack([total * across, total * down, -moment], axis=1).reshape(6, -1)
 
 
-def collect(view: View, method: Method, first: Array | None = None) -> Blended:
+def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     """Find the visible pieces, and the sum of what they add to the image.
 
-    With `first`, the number of a visible piece, only records are made, from that piece on.
+    With `start`, the `following` of earlier records, only those are made that begin there.
     """
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    edges = view.topology.edges
     pixels = to_pixels(view.positions_clip, height, width)
     volume = facing(pixels, view.faces)
     if method.cull_backfaces:
         front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
         volume = stored(jnp.where(front, volume, 0))
-    order, edge_count = choose_edges(edges, volume, view.apart)
+
+    def is_wanted(total: Blended) -> Array:
+        return has_room(total.records)
+
+    goes_on = None if start is None else is_wanted
+    work = [_edges(view, method, pixels, volume, goes_on)]
+    if view.topology.bodies is not None:
+        work.append(_piercing(view, method, pixels, volume))
+    if view.cast is not None:
+        work.append(_shadows(view, view.cast, method, pixels))
+    # Made of the image: else what it is added to would be made, and held, before the image is.
+    zero = stored(work[0].size & 0, view.image[0, 0, 0])
+    blended = _nothing(view, method, start, zero)
+    passed = zero
+    for order, size, at_once, add in work:
+
+        def add_batch(indices: Array, exists: Array, total: Blended, add: Add = add) -> Blended:
+            total = add(indices, exists, total)
+            return total._replace(records=after_batch(total.records))
+
+        first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
+        blended = over_batches(
+            order, size, at_once, add_batch, blended, first=first, goes_on=goes_on
+        )
+        passed = passed + batches_of(size, at_once)
+    return blended
+
+
+def _edges(
+    view: View,
+    method: Method,
+    pixels: Array,
+    volume: Array,
+    goes_on: Callable[[Blended], Array] | None,
+) -> Work:
+    """The edges of the mesh; within a batch of them, too, only while `goes_on(total)`."""
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    edges = view.topology.edges
+    order, count = choose_edges(edges, volume, view.apart)
     bare_blocks = blocks_with_background(view.face_image)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
@@ -170,8 +218,7 @@ def collect(view: View, method: Method, first: Array | None = None) -> Blended:
             edge, exists, edges, view.faces, pixels, volume, height=height, width=width
         )
         ends = prefix_sum(segments.parts)
-
-        cuts = (ends[-1] + CUT_AT_ONCE - 1) // CUT_AT_ONCE
+        cuts = batches_of(ends[-1], CUT_AT_ONCE)
 
         def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
             n, waiting = state
@@ -195,30 +242,21 @@ def collect(view: View, method: Method, first: Array | None = None) -> Blended:
                 view.face_image,
                 bare_blocks,
             )
-            total = _with_pieces(state[2], view, method, segments, pieces, found, first)
+            total = _with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
 
         def is_left(state: tuple[Array, Waiting, Blended]) -> Array:
-            return (state[0] < cuts) | (state[1].total > 0)
+            left = (state[0] < cuts) | (state[1].total > 0)
+            return left if goes_on is None else left & goes_on(state[2])
 
         start = ends[-1] & 0, none_waiting(segments), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    # Made of the image: else what it is added to would be made, and held, before the image is.
-    zero = stored(edge_count & 0, view.image[0, 0, 0])
-    nothing = _nothing(view, method, first, zero)
-    blended = over_batches(order, edge_count, EDGES_AT_ONCE, add_edges, nothing)
-    if view.topology.bodies is not None:
-        blended = _add_piercing(blended, view, method, pixels, volume, first)
-    if view.cast is not None:
-        blended = _add_shadows(blended, view, view.cast, method, pixels, first)
-    return blended
+    return Work(order, count, EDGES_AT_ONCE, add_edges)
 
 
-def _add_piercing(
-    total: Blended, view: View, method: Method, pixels: Array, volume: Array, first: Array | None
-) -> Blended:
-    """Add the lines along which surfaces pierce each other."""
+def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
+    """The lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
     order, count = choose_pixels(view.face_image, bodies)
@@ -228,17 +266,15 @@ def _add_piercing(
         crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
-            return _with_line(total, view, method, lines_of(crossings, pair, exists), first)
+            return _with_line(total, view, method, lines_of(crossings, pair, exists))
 
         return over_batches(crossings.pairs, crossings.total, LINES_AT_ONCE, add_lines, total)
 
-    return over_batches(order, count, PIXELS_AT_ONCE, add_pixels, total)
+    return Work(order, count, PIXELS_AT_ONCE, add_pixels)
 
 
-def _add_shadows(
-    total: Blended, view: View, cast: Cast, method: Method, pixels: Array, first: Array | None
-) -> Blended:
-    """Add the outlines of shadows."""
+def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
+    """The outlines of shadows."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     order, count = choose_shadowed(cast)
 
@@ -253,25 +289,19 @@ def _add_shadows(
 
         def add_lines(n: Array, total: Blended) -> Blended:
             line = shadow_of(outlines, n, column, weight_of_light, pixel, view.faces)
-            return _with_shadow(total, view, method, pixel, light, line, first)
+            return _with_shadow(total, view, method, pixel, light, line)
 
         most = jnp.max(jnp.sum(outlines.exists, axis=0))
         return lax.fori_loop(0, most, add_lines, total)
 
-    return over_batches(order, count, SHADOWED_AT_ONCE, add_pixels, total)
+    return Work(order, count, SHADOWED_AT_ONCE, add_pixels)
 
 
-def _nothing(view: View, method: Method, first: Array | None, zero: Array) -> Blended:
+def _nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
-    rows, channels, dtype = method.capacity, view.image.shape[2], view.image.dtype
-    records = Records(
-        zero,
-        jnp.zeros((rows, 6), jnp.int32) + zero,
-        jnp.zeros((rows, channels), dtype) + zero,
-        jnp.zeros((rows, 2), dtype) + zero,
-        jnp.zeros((rows, 6), dtype) + zero,
-    )
-    if first is not None:
+    channels, dtype = view.image.shape[2], view.image.dtype
+    records = no_records(method.capacity, channels, dtype, start, zero)
+    if start is not None:
         return Blended(records, None)
     own, rims = cropped(view.image, view.image.shape), jnp.zeros(view.face_image.size, dtype)
     return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims + zero))
@@ -304,7 +334,6 @@ def _with_pieces(
     segments: Segments,
     pieces: Pieces,
     found: Seen,
-    first: Array | None,
 ) -> Blended:
     """Add pieces of edges."""
     rim = found.rim
@@ -354,12 +383,10 @@ def _with_pieces(
         jnp.stack([area, rim_length], axis=-1),
         stored(outward * _motion(segments, pieces, found)).T,
     )
-    return Blended(_with_rows(total.records, used, rows, first), sums)
+    return Blended(with_rows(total.records, used, rows), sums)
 
 
-def _with_line(
-    total: Blended, view: View, method: Method, line: Line, first: Array | None
-) -> Blended:
+def _with_line(total: Blended, view: View, method: Method, line: Line) -> Blended:
     """Add lines where surfaces pierce each other."""
     area = _area(line.begin, line.end)
     places = [_place(view, line.pixel, look) for look in line.look]
@@ -375,7 +402,7 @@ def _with_line(
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
     use = jnp.stack([line.used] * 3)
-    records = _with_lines(total.records, use, own, places, jump, area, corners, motion, first)
+    records = with_lines(total.records, use, own, places, jump, area, corners, motion)
     return Blended(records, sums)
 
 
@@ -386,7 +413,6 @@ def _with_shadow(
     pixel: Array,
     light: Array,
     line: Shadow,
-    first: Array | None,
 ) -> Blended:
     """Add one line in each pixel across which a light begins."""
     assert method.glow is not None
@@ -401,35 +427,8 @@ def _with_shadow(
     sums, number = _with_values(total.sums, view, pixel, line.used, value, held)
     places = [_place(view, pixel, look) for look in line.look]
     use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
-    records = _with_lines(
-        total.records, use, number, places, jump, area, line.vertices, line.motion, first
-    )
+    records = with_lines(total.records, use, number, places, jump, area, line.vertices, line.motion)
     return Blended(records, sums)
-
-
-def _with_lines(
-    records: Records,
-    used: Array,
-    pixel: Array,
-    places: list[Array],
-    jump: Array,
-    area: Array,
-    vertices: Array,
-    motion: Array,
-    first: Array | None,
-) -> Records:
-    """Record lines that move with more vertices, as several rows each: two in every row."""
-    rows = [
-        (
-            jnp.stack([pixel, places[1], places[0], places[0], *vertices[i]], axis=-1),
-            jump,
-            jnp.stack([area * (i == 0), jnp.zeros_like(area)], axis=-1),
-            stored(motion[i].T),
-        )
-        for i in range(len(used))
-    ]
-    joined = tuple(jnp.concatenate(column) for column in zip(*rows, strict=True))
-    return _with_rows(records, used.reshape(-1), joined, first)
 
 
 def _with_values(
@@ -444,21 +443,6 @@ def _with_values(
     low = low.at[number].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
     high = high.at[number].max(jnp.where(used[:, None], jnp.max(held, axis=0), -jnp.inf))
     return total._replace(added=added, range=(low, high)), number
-
-
-def _with_rows(
-    records: Records, used: Array, rows: tuple[Array, ...], first: Array | None
-) -> Records:
-    """Write rows behind those in use, as far as there is room."""
-    capacity = records.jump.shape[0]
-    ends = prefix_sum(used.astype(jnp.int32))
-    slot = records.total + ends - 1 - (0 if first is None else first)
-    slot = jnp.where(used & (slot >= 0), slot, capacity)
-    columns = (
-        old.at[slot].set(new.astype(old.dtype), mode="drop")
-        for old, new in zip(records[1:], rows, strict=True)
-    )
-    return Records(records.total + ends[-1], *columns)
 
 
 def _along(

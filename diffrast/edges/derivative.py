@@ -11,25 +11,27 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrast.edges.blend import Method, Records, View, collect, cropped
+from diffrast.edges.blend import Method, View, collect, cropped
+from diffrast.edges.records import Records, Start
 
 _ROWS_AT_ONCE = 1024
 
 
 def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: Any) -> Any:
     """Add up what each block of rows contributes; `used` masks the rows behind the last."""
-    rows_at_once = min(_ROWS_AT_ONCE, records.jump.shape[0])
+    capacity = records.jump.shape[0]
+    rows_at_once = min(_ROWS_AT_ONCE, capacity)
+    count = jnp.minimum(records.total - records.row, capacity)
 
     def step(n: Array, total: Any) -> Any:
-        used = n * rows_at_once + jnp.arange(rows_at_once) < records.total
+        used = n * rows_at_once + jnp.arange(rows_at_once) < count
         rows = [
             lax.dynamic_slice_in_dim(column, n * rows_at_once, rows_at_once)
-            for column in records[1:]
+            for column in records.columns
         ]
         return add(used, rows, total)
 
-    rows = jnp.minimum(records.total, records.jump.shape[0])
-    return lax.fori_loop(0, (rows + rows_at_once - 1) // rows_at_once, step, start)
+    return lax.fori_loop(0, (count + rows_at_once - 1) // rows_at_once, step, start)
 
 
 def _over_pieces(
@@ -43,18 +45,24 @@ def _over_pieces(
 
     The pieces that are not recorded are found again, as many at a time as there are rows.
     """
-    rounds = jnp.maximum((records.total + method.capacity - 1) // method.capacity, 1)
-    more = rounds - 1
 
-    def step(n: Array, total: Any) -> Any:
-        first = (n % more + 1) * method.capacity
-        rows = collect(view, method, first).records
-        rows = rows._replace(total=rows.total - first)
-        branches = [lambda total, add=add: _over_rows(rows, add, total) for add in adds]
-        return lax.switch(n // more, branches, total)
+    def step(state: tuple[Array, Start, Any]) -> tuple[Array, Start, Any]:
+        which, start, total = state
+        found = collect(view, method, start).records
+        branches = [lambda total, add=add: _over_rows(found, add, total) for add in adds]
+        total = lax.switch(which, branches, total)
+        ended = found.following.row >= records.total
+        following = jax.tree.map(
+            lambda again, next: jnp.where(ended, again, next), records.following, found.following
+        )
+        return which + ended, following, total
+
+    def is_left(state: tuple[Array, Start, Any]) -> Array:
+        return state[0] < len(adds)
 
     total = _over_rows(records, adds[0], total)
-    total = lax.fori_loop(0, len(adds) * more, step, total)
+    which = jnp.where(records.following.row < records.total, 0, len(adds))
+    total = lax.while_loop(is_left, step, (which, records.following, total))[2]
     return _over_rows(records, adds[1], total) if len(adds) > 1 else total
 
 
