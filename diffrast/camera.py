@@ -397,10 +397,19 @@ def pixel_directions(
     )
     if camera.distortion is not None:
         return _distorted_directions(camera, columns, rows, height, width)
-    centre, steps, depth = _directions(pivoted_matrix(camera)[0][:, :3], height, width)
+    centre, *steps = central_rays(camera, height, width)
     rays = centre + columns[:, None] * steps[0] + rows[:, None, None] * steps[1]
-    sign = jnp.where(dot(centre, depth) < 0, -1, 1)
-    return sign * rays, sign * steps
+    return rays, jnp.stack(steps)
+
+
+def central_rays(camera: Camera, height: int, width: int) -> Float[Array, "3 3"]:
+    """The ray of the picture's centre, and what a step to the next column or row adds to it.
+
+    So any pixel's ray, a world direction away from the viewer, of any length, without distortion.
+    """
+    centre, steps, depth = _directions(pivoted_matrix(camera)[0][:, :3], height, width)
+    rays = jnp.concatenate([centre[None], steps])
+    return jnp.where(dot(centre, depth) < 0, -rays, rays)
 
 
 def _directions(

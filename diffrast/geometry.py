@@ -52,6 +52,7 @@ class Points(NamedTuple):
     inverse_depth: Float[Array, "*size"]
     position: Columns | None = None  # world positions, if they are interpolated already
     normal: Columns | None = None  # likewise
+    place: Columns | None = None  # of pixels: half pixels to the right of the centre, and above it
 
 
 def world_geometry(scene: Scene, shading: str) -> Geometry:
@@ -141,7 +142,8 @@ def points_at(drawn: Drawn, pixels: Pixels, carried: Carried | None = None) -> P
     """What pixels see of what is drawn; `carried` as for `evaluate`."""
     with jax.named_scope("fragments"):
         seen = evaluate(drawn, pixels, carried)
-        return Points(pixels.face, seen.barycentrics, seen.inverse_depth, *seen.attributes)
+        points = Points(pixels.face, seen.barycentrics, seen.inverse_depth, *seen.attributes)
+        return points._replace(place=[pixels.x, pixels.y])
 
 
 def visible_points(drawn: Drawn, face: Array) -> Points:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from diffrast._check import instance_of
 from diffrast._stored import assemble, stored, stored_alone
-from diffrast.camera import Camera
+from diffrast.camera import Camera, central_rays
 from diffrast.deferred import shade_covered
 from diffrast.edges import Glow, Shader, View, antialias_image
 from diffrast.geometry import (
@@ -119,7 +119,10 @@ def render(
         bare = jax.lax.stop_gradient(drawn._replace(attributes=(), projection=None))
         pixels = visible_points(bare, face)  # if there are shadows
         world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
-        world = world._replace(paints=paint_scene(scene, geometry, clip, height, width))
+        world = world._replace(
+            paints=paint_scene(scene, geometry, clip, height, width),
+            rays=None if camera.distortion is not None else central_rays(camera, height, width),
+        )
         # Others look at all vertices or texels for each batch.
         in_batches = settings.shading == "phong" and not world.paints
 

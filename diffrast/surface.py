@@ -46,6 +46,7 @@ class World(NamedTuple):
     geometry: Geometry
     shadows: Shadows | None
     paints: Paints = ()
+    rays: Array | None = None  # `central_rays`; None with distortion
 
 
 def cast_shadows(
@@ -121,7 +122,7 @@ def _shade_phong(world: World, points: Points, reached: Reached) -> Columns:
         )
     with_position, with_viewer = needs(scene.lights, reflectance.specular is not None)
     position = positions_at(geometry, points) if with_position else None
-    to_viewer = _to_viewer(camera, position) if with_viewer else None
+    to_viewer = _to_viewer(world, position, points.place) if with_viewer else None
     distance = _viewer_distance(scene.lights, camera, position)
     surface = Surface(normal, position, to_viewer, distance)
     return phong(surface, reflectance, scene.lights, reached)
@@ -140,7 +141,7 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
     def shaded(reflectance: Reflectance, lights: tuple[Light, ...], corners: Array) -> Array:
         columns = [corners[:, i] for i in range(6)]
         position, normal = columns[:3], columns[3:]
-        to_viewer = _to_viewer(camera, position) if with_viewer else None
+        to_viewer = _to_viewer(world, position) if with_viewer else None
         distance = _viewer_distance(scene.lights, camera, position)
         surface = Surface(normal, position, to_viewer, distance)
         return jnp.stack(phong(surface, reflectance, lights), axis=-1)
@@ -191,10 +192,17 @@ SHADERS: dict[str, Callable[[World, Points, Reached], Columns]] = {
 }
 
 
-def _to_viewer(camera: Camera, position: Columns | None) -> Columns:
-    assert position is not None
-    eye = viewpoint(camera)
-    return normalize_columns([eye[i] - eye[3] * position[i] for i in range(3)])[0]
+def _to_viewer(world: World, position: Columns | None, place: Columns | None = None) -> Columns:
+    """Unit vectors; against the rays of pixels, which do not depend on what these show."""
+    if world.rays is not None and place is not None:
+        centre, right, down = world.rays
+        x, y = (half_pixels / 2 for half_pixels in place)
+        back = [y * down[i] - x * right[i] - centre[i] for i in range(3)]
+    else:
+        assert position is not None
+        eye = viewpoint(world.camera)
+        back = [eye[i] - eye[3] * position[i] for i in range(3)]
+    return normalize_columns(back)[0]
 
 
 def _viewer_distance(

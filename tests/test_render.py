@@ -370,7 +370,7 @@ PRICES = {  # lights, material, shading: values fetched, roots, exponentials at 
     "ambient light only, shiny": (["ambient"], SHINY, "phong", (0, 0, 0)),
     "ambient light added": (["ambient", "directional"], {}, "phong", (9 + 9, 1, 0)),
     "point light": (["point"], {}, "phong", (9 + 9 + 9, 2, 0)),
-    "shiny": (["directional"], SHINY, "phong", (9 + 9 + 9, 2, 1)),
+    "shiny": (["directional"], SHINY, "phong", (9 + 9, 2, 1)),
     "flat": (["directional"], {}, "flat", (3, 1, 0)),
     "gouraud": (["point"], SHINY, "gouraud", (9 + 9, 0, 0)),
     "unlit": (["point"], SHINY, "unlit", (0, 0, 0)),
