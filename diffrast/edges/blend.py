@@ -58,8 +58,9 @@ from diffrast.edges.records import (
     with_rows,
 )
 from diffrast.edges.rim import BESIDE
+from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
-from diffrast.edges.shadow_lines import Cast, Shadow, cross_shadows, shadow_of
+from diffrast.edges.shadow_lines import Cast, Places, Shadow, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look, uncovered
 
@@ -279,20 +280,19 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
     order, count = choose_shadowed(cast)
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
-        pixel = jnp.stack([number % width, number // width % height])
         light = number // (width * height)
         weight_of_light = pixels.shape[1] - cast.weight.size + light
-        column = weight_of_light - cast.weight.size
-        outlines = cross_shadows(
-            light, column, pixel, exists, cast, view.faces, pixels, view.face_image
+        places = Places(
+            light,
+            rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
+            pixel=jnp.stack([number % width, number // width % height]),
         )
+        outlines = cross_shadows(places, exists, cast, view.faces, pixels, view.face_image)
 
-        def add_lines(n: Array, total: Blended) -> Blended:
-            line = shadow_of(outlines, n, column, weight_of_light, pixel, view.faces)
-            return _with_shadow(total, view, method, pixel, light, line)
+        def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
+            return _with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))
 
-        most = jnp.max(jnp.sum(outlines.exists, axis=0))
-        return lax.fori_loop(0, most, add_lines, total)
+        return over_batches(outlines.lines, outlines.total, SHADOWS_AT_ONCE, add_lines, total)
 
     return Work(order, count, SHADOWED_AT_ONCE, add_pixels)
 
@@ -406,26 +406,19 @@ def _with_line(total: Blended, view: View, method: Method, line: Line) -> Blende
     return Blended(records, sums)
 
 
-def _with_shadow(
-    total: Blended,
-    view: View,
-    method: Method,
-    pixel: Array,
-    light: Array,
-    line: Shadow,
-) -> Blended:
-    """Add one line in each pixel across which a light begins."""
+def _with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Blended:
+    """Add lines across which a light begins."""
     assert method.glow is not None
     assert view.cast is not None
     area = _area(line.begin, line.end)
-    glow = jnp.stack(method.glow(view.scene, light, line.face, line.barycentrics), axis=-1)
+    glow = jnp.stack(method.glow(view.scene, line.light, line.face, line.barycentrics), axis=-1)
     jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
-    own = view.image.reshape(-1, view.image.shape[2])[_place(view, pixel, 4)]
+    own = view.image.reshape(-1, view.image.shape[2])[_place(view, line.pixel, 4)]
     to_other = jnp.where(line.centre_is_lit, -1, 1)[:, None] * glow
     value = area[:, None] * jump + jnp.where(line.wrong_side[:, None], to_other, 0)
     held = jnp.stack([own, own + to_other])
-    sums, number = _with_values(total.sums, view, pixel, line.used, value, held)
-    places = [_place(view, pixel, look) for look in line.look]
+    sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held)
+    places = [_place(view, line.pixel, look) for look in line.look]
     use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
     records = with_lines(total.records, use, number, places, jump, area, line.vertices, line.motion)
     return Blended(records, sums)

@@ -16,6 +16,7 @@ do, the point seen at a place of the screen moves along the line of sight.
 import itertools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -28,6 +29,7 @@ from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import Columns, Table, barycentrics, cross_rows, edge_functions
 
 PIXELS_AT_ONCE = 512
+LINES_AT_ONCE = 256
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
@@ -58,10 +60,18 @@ class _Plane(NamedTuple):
     offset: Float[Array, "*n"]  # of h
 
 
+class Places(NamedTuple):
+    """Pixels that outlines of a light's shadows may part."""
+
+    light: Int[Array, " n"]
+    rows: Int[Array, "2 n"]  # of positions, with the light and with its weight
+    pixel: Int[Array, "2 n"]  # column and row
+
+
 class Outlines(NamedTuple):
     """Lines that may part pixels: one for each pair of neighbours, shape (12, n)."""
 
-    exists: Bool[Array, "12 n"]
+    places: Places
     face: Int[Array, " n"]  # on which the shadows fall
     corners: Float[Array, "3 3 n"]  # of it, from the pixel's centre
     vertices: Int[Array, "2 12 n"]  # of the edge
@@ -70,12 +80,17 @@ class Outlines(NamedTuple):
     weight: Float[Array, " n"]  # and its h
     lit_on_right: Bool[Array, "12 n"]
     centre_is_lit: Bool[Array, " n"]  # in the image
+    alone: Bool[Array, " n"]  # whether there is one line only
     range: Float[Array, "2 12 n"]  # begin and end along the line, from the point next to the centre
+    lines: Int[Array, " list"]  # row * n + number of the pixel
+    total: Int[Array, ""]  # of lines
 
 
 class Shadow(NamedTuple):
-    """One line in each of n pixels."""
+    """Lines, one in each of n pixels."""
 
+    pixel: Int[Array, "2 n"]
+    light: Int[Array, " n"]
     used: Bool[Array, " n"]
     face: Int[Array, " n"]  # on which it lies,
     barycentrics: Columns  # and where its middle does
@@ -112,16 +127,15 @@ def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
 
 
 def cross_shadows(
-    light: Int[Array, " n"],
-    column_of_light: Int[Array, " n"],
-    pixel: Int[Array, "2 n"],
+    places: Places,
     exists: Bool[Array, " n"],
     cast: Cast,
     faces: Int[Array, "F 3"],
     pixels: Table,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Outlines:
-    """Find the lines at pixels (column, row); `column_of_light` is where `pixels` has the light."""
+    """Find the lines at these places."""
+    light, rows, pixel = places
     centre = pixel + 0.5
 
     def place(vertex: Array) -> Array:
@@ -141,7 +155,7 @@ def cross_shadows(
     vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in (1, 2)]))
     ends = [place(vertex) for vertex in vertices]
     corners = place(faces.T[:, jnp.maximum(own, 0)])
-    source = place(column_of_light)
+    source = place(rows[0])
     weight = cast.weight[light]
 
     ground = _face_plane(corners[:, :, None])
@@ -179,8 +193,10 @@ def cross_shadows(
         ]
 
     low, high = positive_part(inside(foot - along), inside(foot + along))
+    chosen = chosen & (low < high)
+    lines, total = selected(chosen.reshape(-1))
     return Outlines(
-        exists=chosen & (low < high),
+        places=places,
         face=own,
         corners=corners,
         vertices=vertices,
@@ -189,40 +205,46 @@ def cross_shadows(
         weight=weight,
         lit_on_right=lit_on_right,
         centre_is_lit=cast.lit[light, pixel[1] + 1, pixel[0] + 1],
+        alone=jnp.sum(chosen, axis=0) == 1,
         range=_REACH * (2 * jnp.stack([low, high]) - 1),
+        lines=lines,
+        total=total,
     )
 
 
 def shadow_of(
     outlines: Outlines,
-    number: Array,
-    light: Int[Array, " n"],
-    weight_of_light: Int[Array, " n"],
-    pixel: Int[Array, "2 n"],
+    line: Int[Array, " n"],
+    exists: Bool[Array, " n"],
     faces: Int[Array, "F 3"],
 ) -> Shadow:
-    """The line with this number, 0 and up, in each pixel.
-
-    `light` and `weight_of_light` are the rows of positions that have them.
-    """
-    rank = jnp.cumsum(outlines.exists, axis=0) - 1
-    here = outlines.exists & (rank == number)
-    row = stored(jnp.minimum(first_row(here), 11))
-    used = jnp.any(here, axis=0)
+    """These lines, and how they move."""
+    row, place = line // outlines.face.size, line % outlines.face.size
 
     def one(values: Array) -> Array:
-        return values[..., row, jnp.arange(row.size)]
+        return values[..., row, place]
 
+    (light, rows_of_light, pixel), face, corners, source, weight = stored(
+        jax.tree.map(
+            lambda values: values[..., place],
+            (
+                outlines.places,
+                outlines.face,
+                outlines.corners,
+                outlines.source,
+                outlines.weight,
+            ),
+        )
+    )
+    centre_is_lit, alone = outlines.centre_is_lit[place], outlines.alone[place]
     start, end = stored((one(outlines.ends[0]), one(outlines.ends[1])))
-    source, weight = outlines.source, outlines.weight
-    ground, shadow = _face_plane(outlines.corners), _shadow_plane(source, weight, start, end)
+    ground, shadow = _face_plane(corners), _shadow_plane(source, weight, start, end)
     normal, foot, inverse = _line(ground, shadow)
     along = jnp.stack([-normal[1], normal[0]])
     low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
     centre_on_right = _dot(foot, normal) < 0
-    alone = jnp.sum(outlines.exists, axis=0) == 1
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
@@ -238,7 +260,7 @@ def shadow_of(
         (_dot(plane.normal, point) + plane.offset * depth) / _nonzero(_dot(plane.normal, away))
         for plane, away in zip(planes, at, strict=True)
     ]
-    e, volume = edge_functions(outlines.corners, x, y)
+    e, volume = edge_functions(corners, x, y)
     per_plane = (high - low) * inverse
     turn = per_plane * shadow.offset / _nonzero(volume)
     motions = [-per_plane * ground.offset * share * shadow.normal for share in shares]
@@ -248,9 +270,8 @@ def shadow_of(
     of_pairs = [jnp.concatenate([_of_screen(m, pixel) for m in row]) for row in rows]
     of_weight = jnp.zeros_like(of_pairs[0]).at[2].set(weight_motion)
     motion = jnp.stack([*of_pairs, of_weight])
-    corners = faces[outlines.face].T
-    vertices = [one(outlines.vertices[0]), one(outlines.vertices[1]), *corners, light]
-    vertices = [*vertices, weight_of_light, weight_of_light]
+    lamp, its_weight = rows_of_light
+    vertices = [*one(outlines.vertices), *faces[face].T, lamp, its_weight, its_weight]
 
     # Of the two neighbours between which it passes one is on its right.
     looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
@@ -258,17 +279,19 @@ def shadow_of(
     second_on_right = jnp.where(step == 1, normal[0], normal[1]) > 0
     look = jnp.where(second_on_right, looks[::-1], looks)
     return Shadow(
-        used=used,
-        face=outlines.face,
+        pixel=pixel,
+        light=light,
+        used=exists,
+        face=face,
         barycentrics=barycentrics(e),
         look=look,
         lit_on_right=lit_on_right,
-        centre_is_lit=outlines.centre_is_lit,
-        wrong_side=alone & ((lit_on_right == centre_on_right) != outlines.centre_is_lit),
+        centre_is_lit=centre_is_lit,
+        wrong_side=alone & ((lit_on_right == centre_on_right) != centre_is_lit),
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
         vertices=jnp.stack(vertices).reshape(4, 2, -1),
-        motion=jnp.where(used, motion, 0),
+        motion=jnp.where(exists, motion, 0),
     )
 
 
