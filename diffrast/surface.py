@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from diffrast._stored import stored
 from diffrast._topology import Topology
 from diffrast.camera import Camera, direction_to_clip, viewpoint, world_to_clip
 from diffrast.edges import Cast
@@ -197,7 +198,9 @@ def _to_viewer(world: World, position: Columns | None, place: Columns | None = N
     if world.rays is not None and place is not None:
         centre, right, down = world.rays
         x, y = (half_pixels / 2 for half_pixels in place)
-        back = [y * down[i] - x * right[i] - centre[i] for i in range(3)]
+        # Products are stored: whether XLA joins one with a sum depends on the program round it.
+        across, up = stored(([x * part for part in right], [y * part for part in down]))
+        back = [up[i] - across[i] - centre[i] for i in range(3)]
     else:
         assert position is not None
         eye = viewpoint(world.camera)

@@ -25,7 +25,8 @@ def camera(turn):
 
 
 def scene(direction=(-0.4, -0.5, -1.0)):
-    return dr.Scene(objects=[dr.Object(MESH)], lights=[dr.DirectionalLight(direction=direction)])
+    shiny = dr.Object(MESH, dr.Material(specular=(0.5, 0.5, 0.5)))
+    return dr.Scene(objects=[shiny], lights=[dr.DirectionalLight(direction=direction)])
 
 
 CAMERAS = dr.stack_cameras([camera(turn) for turn in TURNS])
