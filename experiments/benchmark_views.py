@@ -9,8 +9,8 @@ single call over that of a view among many. Also measured: the peak of memory, w
 chunk and not with the views; the gain of all cores over one; and that pictures and gradients have
 the same bits for chunks of 1, 3 and 16 views and on 1, 2, 4 and 8 devices, made of the CPU.
 
-Expected: on two cores a gain of 1.7 to 2.3 at 64 x 64 and of 1.4 to 1.8 at 256 x 256; a call for
-one view takes a millisecond more than `render`.
+Expected: on two cores a gain of 1.9 to 2.6 at 64 x 64 and of 1.5 to 2.8 at 256 x 256; a call for
+one view takes one or two milliseconds more than `render`.
 
 Written to `--out`: `benchmark_views.json`, `.md` and `.png`. Ten minutes on two cores.
 """
@@ -198,15 +198,17 @@ def run(
     progress: bool = False,
 ) -> dict[str, Any]:
     """Measure, if wanted also what needs own processes (on Linux); return what is written."""
-    rows = throughput(meshes, counts, gradients, repeats, antialias=antialias, progress=progress)
-    report: dict[str, Any] = {"throughput": rows}
+    report: dict[str, Any] = {}
     if elsewhere_too:
         small, large, cores = min(counts), max(counts), len(os.sched_getaffinity(0))
-        report |= {
+        report = {
+            "same_bits": elsewhere("bits", small, 2 * max(DEVICES) + 3),
             "peak_megabytes": elsewhere("memory", large, *counts[large][1:]),
             "cores": {n: elsewhere("cores", small, 64, repeats, cores=n) for n in (1, cores)},
-            "same_bits": elsewhere("bits", small, 2 * max(DEVICES) + 3),
         }
+    report["throughput"] = throughput(
+        meshes, counts, gradients, repeats, antialias=antialias, progress=progress
+    )
     write_report(out, "benchmark_views", report, table, plot)
     return report
 
