@@ -399,3 +399,19 @@ def test_buffers_without_shadows_and_without_objects():
 def test_errors_name_the_argument(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_neither_of_two_bodies_shades_the_line_where_it_pierces_the_other():
+    """Both are lit in front of it: nothing in view is dark, at any sample of the line."""
+    dull = dr.Material(diffuse=(1.0, 1.0, 1.0))
+    sunk = dr.linalg.translation((0.13, 0.0, 0.91))
+    scene = dr.Scene(
+        objects=[dr.Object(dr.shapes.plane(8, 8), dull), dr.Object(dr.shapes.cube(), dull, sunk)],
+        lights=[dr.DirectionalLight(direction=(0, 0.6, -0.8), shadow=dr.Shadow(resolution=128))],
+        background=(1, 1, 1),
+    )
+    camera = dr.Camera.perspective(
+        eye=(0.3, -6, 3), target=(0, -1, 0), up=(0, 0, 1), fov_y=0.4, near=0.5, far=20
+    )
+    image = dr.render(scene, camera, dr.RenderSettings(height=64, width=64))
+    assert float(image.min()) > 0.59  # the cube's front, the least lit

@@ -219,6 +219,11 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     used = exists & (inverse * rounding < 1) & (low < high) & through
     used = used & ~_hidden(planes, x, y, depth[0])
 
+    # Seen a little aside, where each is in front: on the line itself either may shade the other.
+    step = _THROUGH * jnp.array([[1], [-1]])
+    aside = values + step * (normal[0] * at[1] + normal[1] * at[2])
+    total = jnp.sum(aside, axis=0)
+
     centre = pixel + 0.5
     plane = jnp.stack(
         [sums[1], sums[2], depth - (x + centre[0]) * sums[1] - (y + centre[1]) * sums[2]]
@@ -231,7 +236,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
         used=used,
         look=both(planes.look),
         face=both(planes.face),
-        barycentrics=[value / jnp.where(depth > 0, depth, 1) for value in values],
+        barycentrics=[value / jnp.where(total > 0, total, 1) for value in aside],
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
