@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrast._selection import batches_of
 from diffrast.edges.blend import Method, View, collect, cropped
 from diffrast.edges.records import Records, Start
 
@@ -31,7 +32,7 @@ def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: A
         ]
         return add(used, rows, total)
 
-    return lax.fori_loop(0, (count + rows_at_once - 1) // rows_at_once, step, start)
+    return lax.fori_loop(0, batches_of(count, rows_at_once), step, start)
 
 
 def _over_pieces(

@@ -211,8 +211,8 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     depth = jnp.sum(values, axis=0)
 
     # Both reach to both sides.
-    slope = abs(at[1] * normal[0] + at[2] * normal[1])
-    through = jnp.min(values - _THROUGH * slope, axis=(0, 1)) > 0
+    aside = _THROUGH * (at[1] * normal[0] + at[2] * normal[1])
+    through = jnp.min(values - abs(aside), axis=(0, 1)) > 0
     # Faces that lie on one another differ by rounding, and have no line.
     largest = jnp.max(abs(at), axis=(0, 1))
     rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[0] + largest[1])
@@ -220,9 +220,8 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     used = used & ~_hidden(planes, x, y, depth[0])
 
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
-    step = _THROUGH * jnp.array([[1], [-1]])
-    aside = values + step * (normal[0] * at[1] + normal[1] * at[2])
-    total = jnp.sum(aside, axis=0)
+    in_front = values + aside * jnp.array([[1], [-1]])
+    total = jnp.sum(in_front, axis=0)
 
     centre = pixel + 0.5
     plane = jnp.stack(
@@ -236,7 +235,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
         used=used,
         look=both(planes.look),
         face=both(planes.face),
-        barycentrics=[value / jnp.where(total > 0, total, 1) for value in aside],
+        barycentrics=[value / jnp.where(total > 0, total, 1) for value in in_front],
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),

@@ -21,13 +21,13 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import batches_of
 from diffrast.edges.derivative import linear_zeros
 from diffrast.lines.hidden import Surface, hides
 from diffrast.lines.overlap import coverage
 from diffrast.lines.pixels import (
     LINES_AT_ONCE,
     blocks_of,
-    chunks_of,
     lines_of_steps,
     number_steps,
 )
@@ -223,7 +223,7 @@ def _over_terms(
             )
             return add(state, terms)
 
-        return lax.fori_loop(0, chunks_of(numbering, STEPS_AT_ONCE), in_chunk, state)
+        return lax.fori_loop(0, batches_of(numbering.total, STEPS_AT_ONCE), in_chunk, state)
 
     return lax.fori_loop(0, bands.steps.shape[0], in_block, state)
 

@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import batches_of
 from diffrast.lines.hidden import Surface, hides
 from diffrast.lines.segments import Segments
 from diffrast.raster.fixed_point import subpixel_bits
@@ -154,11 +155,6 @@ def number_steps(count: Array) -> Numbering:
     return Numbering(ends - count, ends[-1])
 
 
-def chunks_of(numbering: Numbering, size: int) -> Array:
-    """Number of chunks that hold all steps."""
-    return (numbering.total + size - 1) // size
-
-
 def lines_of_steps(numbering: Numbering, chunk: Array, size: int) -> tuple[Array, Array, Array]:
     """Line and step within it of a chunk of steps, and whether there is such a step."""
     begin = chunk * size
@@ -263,7 +259,7 @@ def _steps(
                     place = jnp.where(hidden, pixels, place)
                 return add(state, place, n * block + line, step.key)
 
-            return lax.fori_loop(0, chunks_of(numbering, STEPS_AT_ONCE), in_chunk, state)
+            return lax.fori_loop(0, batches_of(numbering.total, STEPS_AT_ONCE), in_chunk, state)
 
         return lax.fori_loop(0, course.steps.shape[0], in_block, state)
 

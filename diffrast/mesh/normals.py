@@ -6,6 +6,7 @@ edges divided by the face's size s, and enters the sum with the factor (s / S)²
 largest s at that vertex: the factors common to a vertex cancel.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -87,14 +88,7 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
     _check.one_of("weighting", weighting, WEIGHTINGS)
     groups = jnp.asarray(_weld(mesh.vertices)) if _check.flag("weld", weld) else None
     normals = _vertex_normals(mesh.vertices, mesh.faces, groups, weighting)
-    return Mesh(
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        normals=normals,
-        uvs=mesh.uvs,
-        uv_faces=mesh.uv_faces,
-        topology=mesh.topology,
-    )
+    return replace(mesh, normals=normals)
 
 
 _weld = weld  # `weld` is also the name of an option

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
+from diffrast._selection import batches_of
 from diffrast.raster.edge_functions import (
     Edge,
     Image,
@@ -267,7 +268,7 @@ def _draw_sweeps(
 
         return lax.while_loop(lambda s: s[0] < _END, draw, (walk.first, *state))[1:]
 
-    chunks = (stop - first + CHUNK - 1) // CHUNK
+    chunks = batches_of(stop - first, CHUNK)
     return lax.fori_loop(0, chunks, draw_chunk, (buffer, lowest_keys))[0]
 
 
