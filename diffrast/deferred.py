@@ -4,9 +4,8 @@ A picture alone is shaded in one go, a large one only if it shows a face. With i
 are hundreds of values for each pixel between faces and colours, more than memory can pass along in
 good time: so the image is cut into runs of pixels, runs without a face are left out, and the others
 are shaded in batches that stay in cache. A reverse pass goes through the batches again and begins
-by repeating each. Very large pictures, and large ones with shadows, are shaded so without a
-derivative, too: temporary memory of more than 32 MB is given back after each call, and a new one
-costs more than the shading.
+by repeating each. Very large pictures are shaded so without a derivative, too: temporary memory of
+more than 32 MB is given back after each call, and a new one costs more than the shading.
 """
 
 from collections.abc import Callable
@@ -21,15 +20,15 @@ from jaxtyping import Int
 from diffrast._selection import compacted
 from diffrast._stored import zero_after
 from diffrast._varying import varying_alike, varying_zero
-from diffrast.geometry import Points, points_at
+from diffrast.geometry import Points, points_at, visible_points
 from diffrast.light import Columns
-from diffrast.raster.evaluate import Drawn, Pixels, all_pixels, carry, pixels_at
+from diffrast.raster.evaluate import Drawn, Pixels, carry, pixels_at
 from diffrast.shadows import Reached
 
 RUN = 32  # pixels
 RUNS_AT_ONCE = 512
 LARGE = 90_000  # pixels: what smaller images need is fast to store
-VERY_LARGE = 5 << 16  # pixels: the same without a derivative or shadows
+VERY_LARGE = 5 << 16  # pixels: the same without a derivative
 
 
 class _Runs(NamedTuple):
@@ -47,6 +46,7 @@ class _Inputs(NamedTuple):
     face: Int[Array, "height width"]
     reached: Reached
     background: Columns
+    points: Points | None
 
 
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
@@ -61,6 +61,7 @@ def shade_covered(
     background: Columns,
     *,
     in_batches: bool,
+    points: Points | None = None,
 ) -> Columns:
     """Colours of the pixels that see a face and of those that see the background, in whole images.
 
@@ -73,16 +74,16 @@ def shade_covered(
         reached: by each light; images.
         background: numbers or images.
         in_batches: whether large images, or their derivatives, may be.
+        points: what the pixels see, if that is known: without attributes and without a derivative.
     """
-    inputs = _Inputs(data, drawn, face, reached, background)
+    inputs = _Inputs(data, drawn, face, reached, background, points)
     if not in_batches or face.size <= LARGE:
-        return _in_one_go(shade, inputs)
-    has_shadows = any(part is not None for part in reached)
+        return _in_one_go(shade, inputs._replace(points=None))
 
     @jax.custom_jvp
     def colors(inputs: _Inputs) -> Columns:
         def shaded(inputs: _Inputs) -> Columns:
-            way = _in_batches if has_shadows or face.size > VERY_LARGE else _in_one_go
+            way = _in_batches if face.size > VERY_LARGE else _in_one_go
             zero = varying_zero(inputs)
             return [c + zero.astype(c.dtype) for c in way(shade, inputs)]
 
@@ -106,8 +107,8 @@ def shade_covered(
 
 
 def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
-    pixels = all_pixels(inputs.face, inputs.drawn.positions_clip.dtype)
-    colors = shade(inputs.data, points_at(inputs.drawn, pixels), inputs.reached)
+    points = inputs.points or visible_points(inputs.drawn, inputs.face)
+    colors = shade(inputs.data, points, inputs.reached)
     return _before_background(colors, inputs)
 
 
@@ -123,7 +124,7 @@ def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
 
 
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
-    data, drawn, face, reached, _ = inputs
+    data, drawn, face, reached = inputs[:4]
     runs, seen = _covered_runs(face), _in_runs(face, -1)
     parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.

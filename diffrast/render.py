@@ -128,7 +128,16 @@ def render(
 
         shader = SHADERS[settings.shading]
         behind = [background[..., c] for c in range(3)]
-        color = shade_covered(shader, world, drawn, face, reached, behind, in_batches=in_batches)
+        color = shade_covered(
+            shader,
+            world,
+            drawn,
+            face,
+            reached,
+            behind,
+            in_batches=in_batches,
+            points=None if world.shadows is None else pixels,
+        )
     if settings.antialias:
         with jax.named_scope("edges"):
             image = assemble([stored_alone(channel) for channel in color])

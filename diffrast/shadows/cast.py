@@ -112,7 +112,7 @@ def _regards(
     geometry: Geometry,
     points: Points,
 ) -> list[_Regard]:
-    position = positions_at(geometry, points)
+    position = stored(positions_at(geometry, points))
     visible = jnp.maximum(points.face, 0)
     regards = []
     for light, view, outside in zip(lights, views, turned, strict=True):

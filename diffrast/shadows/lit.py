@@ -20,7 +20,7 @@ from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
-from diffrast.shadows.maps import Pictures
+from diffrast.shadows.maps import Pictures, Smooth
 from diffrast.shadows.near import (
     ROUNDINGS,
     Line,
@@ -65,10 +65,10 @@ def lit(
 ) -> Float[Array, " n"]:
     """1 where a light sees points that are asked for, 0 elsewhere. Not differentiable."""
     texel = texel_of(pictures, rays)
-    key, slope_x, slope_y, error = _at_texels(pictures.texel, rays.picture, texel).T
-    depth = key + slope_x * texel.x + slope_y * texel.y
-    bright = rays.asked & (rays.key >= depth - error - _rounding(rays))
-    order, count = selected(rays.asked & jnp.isinf(error))
+    floor, slope_x, slope_y = _at_texels(pictures.smooth, rays.picture, texel)
+    least = floor + slope_x * texel.x + slope_y * texel.y
+    bright = rays.asked & (rays.key >= least - _rounding(rays))
+    order, count = selected(rays.asked & jnp.isinf(floor))
     at_once = min(_AT_ONCE, 512 * -(-rays.x.size // 4096))  # some of few, as edges have
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
@@ -78,7 +78,7 @@ def lit(
         hidden = _hidden(pictures, geometry, neighbors, some, sight, doubt)
         return bright.at[jnp.where(hidden, chosen, bright.size)].set(False, mode="drop")
 
-    return over_batches(order, count, at_once, look_closer, bright).astype(key.dtype)
+    return over_batches(order, count, at_once, look_closer, bright).astype(floor.dtype)
 
 
 def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
@@ -86,11 +86,10 @@ def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
     return stored(jax.tree.map(lambda column: column[..., chosen], columns))
 
 
-def _at_texels(values: Array, picture: Array, texel: Texel) -> Array:
-    """Entries of an array (pictures, size, size, ...)."""
-    size = values.shape[1]
-    number = (picture * size + texel.row) * size + texel.column
-    return values.reshape(-1, *values.shape[3:])[stored(number)]
+def _at_texels(smooth: Smooth, picture: Array, texel: Texel) -> list[Array]:
+    size = smooth.floor.shape[1]
+    number = stored((picture * size + texel.row) * size + texel.column)
+    return [values.reshape(-1)[number] for values in smooth]
 
 
 def _rounding(rays: Rays) -> Array:
@@ -100,7 +99,7 @@ def _rounding(rays: Rays) -> Array:
 def _sight(pictures: Pictures, geometry: Geometry, rays: Rays) -> _Sight:
     own = face_corners(geometry, rays.face)
     texel, nine = texel_of(pictures, rays), jnp.arange(9)[:, None]
-    key = pictures.texel[rays.picture, *texels_round(pictures, texel), 0]
+    key = pictures.key[rays.picture, *texels_round(pictures, texel)]
     slopes, _ = _slopes(pictures, rays, own)
     along_row = slopes[0] * (texel.x - (nine % 3 - 1))
     along_column = slopes[1] * (texel.y - (nine // 3 - 1))

@@ -3,12 +3,13 @@
 Every texel holds the nearest face and its depth key. Where the keys of the 3×3 texels round one lie
 on one smooth surface (their second differences are smaller than half a texel's width), what is near
 that surface is in the light and what is behind it is not, without a look at any face. So each texel
-also holds the slope of the keys and the largest of those differences: the error of extrapolation
-from the texel's centre, infinite where the surface is not smooth.
+also holds the slopes of the keys, and its key less the largest of those differences, which is the
+error of extrapolation from the texel's centre: minus infinity where the surface is not smooth.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
@@ -36,12 +37,21 @@ class Plan(NamedTuple):
     wanted: Bool[Array, "n"]
 
 
+class Smooth(NamedTuple):
+    """The surface at texels; apart, as arrays are read quickest."""
+
+    floor: Float[Array, "n size size"]  # the lowest key in the light, or minus infinity
+    slope_x: Float[Array, "n size size"]  # of the keys, from column to column
+    slope_y: Float[Array, "n size size"]  # and from row to row
+
+
 class Pictures(NamedTuple):
     """What lights see."""
 
     plan: Plan
     face: Int[Array, "n size size"]
-    texel: Float[Array, "n size size 4"]  # key, its slopes along columns and rows, their error
+    key: Float[Array, "n size size"]
+    smooth: Smooth
 
 
 def plan(
@@ -80,34 +90,35 @@ def plan(
 def take(plans: Plan, geometry: Geometry, size: int) -> Pictures:
     """Take pictures, one after another; unwanted ones stay empty."""
 
-    def draw(plan: Plan) -> tuple[Array, Array]:
-        def wanted() -> tuple[Array, Array]:
+    def draw(plan: Plan) -> tuple[Array, Array, Smooth]:
+        def wanted() -> tuple[Array, Array, Smooth]:
             offset = geometry.positions - plan.origin
             x, y, w, k = (apply_matrix(plan.matrix[:, :3], offset) + plan.matrix[:, 3]).T
             half = size / 2
             clip = assemble(stored([x / half - w, w - y / half, plan.depth * k, w]))
             face, key = faces_and_depths(clip, geometry.faces, size=size)
-            return face, _texels(key, plan.limit)
+            return face, key, _smooth(key, plan.limit)
 
-        def nothing() -> tuple[Array, Array]:
+        def nothing() -> tuple[Array, Array, Smooth]:
             zero = plan.depth * 0  # varies as the data do
             face = jnp.full((size, size), -1, jnp.int32) + zero.astype(jnp.int32)
-            return face, jnp.zeros((size, size, 4), zero.dtype) + zero
+            zeros = jnp.zeros((size, size), zero.dtype) + zero
+            return face, zeros, Smooth(zeros, zeros, zeros)
 
         return lax.cond(plan.wanted, wanted, nothing)
 
     if plans.wanted.shape[0] > 1:
         return Pictures(plans, *lax.map(draw, plans))
-    face, texel = draw(Plan(*(column[0] for column in plans)))
-    return Pictures(plans, face[None], texel[None])
+    alone = draw(Plan(*(column[0] for column in plans)))
+    return Pictures(plans, *jax.tree.map(lambda column: column[None], alone))
 
 
 def _range(column: Array, some: Array) -> tuple[Array, Array]:
     return jnp.min(jnp.where(some, column, jnp.inf)), jnp.max(jnp.where(some, column, -jnp.inf))
 
 
-def _texels(key: Float[Array, "size size"], limit: Float[Array, "2"]) -> Array:
-    """Key, slopes and error at each texel; the error is infinite at the border."""
+def _smooth(key: Float[Array, "size size"], limit: Float[Array, "2"]) -> Smooth:
+    """The surface at each texel; none at the border."""
     size = key.shape[0]
     around = jnp.pad(key, 1, constant_values=-jnp.inf)
 
@@ -121,4 +132,4 @@ def _texels(key: Float[Array, "size size"], limit: Float[Array, "2"]) -> Array:
         error = jnp.maximum(error, jnp.abs((one - key) + (other - key)))
     smooth = error <= limit[0] + limit[1] * key  # NaN, and not smooth, where there is nothing
     slopes = [jnp.where(smooth, (a - b) / 2, 0) for a, b in pairs[:2]]
-    return assemble(stored([key, *slopes, jnp.where(smooth, error, jnp.inf)]))
+    return stored(Smooth(jnp.where(smooth, key - error, -jnp.inf), *slopes))

@@ -104,7 +104,7 @@ def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays, line: Line) -
     cut = cut_by(Line(*(column[..., None, :] for column in line)), others)
     foreign = (around >= 0) & (around != rays.face)
     cut = cut._replace(stops=jnp.where(foreign, cut.stops, -1))
-    return Nearby(around, pictures.texel[*texels, 0], others, cut)
+    return Nearby(around, pictures.key[texels], others, cut)
 
 
 def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:
