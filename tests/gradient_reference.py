@@ -18,6 +18,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ LIGHT_GROUPS_OF = {
     "point": ["light position"],
     "spot": list(LIGHT_GROUPS),
 }
-STEP = 0.1  # pixels
+STEP = 0.05  # pixels
 SEED = 20240611
 
 
@@ -71,7 +72,7 @@ class Problem:
 
     Shadows of object 0 on the plane of the last object are what steps of the first light that
     casts any are measured by. `piercing` tells that faces intersect; `nodes` is the order of
-    `render_box`'s integration.
+    `render_box`'s integration, and `lines` how many of its lines a pixel has for derivatives.
     """
 
     objects: list[Object]
@@ -88,6 +89,7 @@ class Problem:
     cull_backfaces: bool = False
     piercing: bool = False
     nodes: int = 3
+    lines: int = 64
     size: int = 96
 
 
@@ -321,11 +323,13 @@ def step_sizes(problem) -> np.ndarray:
     return np.array([tiny / moved if moved else 0.0 for moved in pixels])
 
 
-def reference_jacobian(problem, lines=32, step=STEP) -> np.ndarray:
+def reference_jacobian(problem, lines=None, step=STEP) -> np.ndarray:
     """Return the derivatives (P, H, W, 3) of the image at rest.
 
-    Central differences D over `step` pixels and twice as many give (4 D(step) - D(2 step)) / 3.
+    Central differences D over `step` pixels and twice as many give 2 D(step) - D(2 step): a pixel
+    that an outline enters bends the image, and adds an error in proportion to the step.
     """
+    lines = lines or problem.lines
     levelness = _levelness(reference_image(problem, lines=lines))
 
     def difference(change) -> np.ndarray:
@@ -335,7 +339,7 @@ def reference_jacobian(problem, lines=32, step=STEP) -> np.ndarray:
         return (ahead - behind) / (2 * np.linalg.norm(change))
 
     changes = step * np.diag(step_sizes(problem))
-    return np.stack([(4 * difference(c) - difference(2 * c)) / 3 for c in changes])
+    return np.stack([2 * difference(c) - difference(2 * c) for c in changes])
 
 
 def adjoint_fields(size=96, count=16) -> np.ndarray:
@@ -393,10 +397,8 @@ def torus(edge) -> Problem:
     around, across = round(157 / edge), max(round(63 / edge), 8)
     mesh = dr.shapes.torus(1.0, 0.4, major_segments=around, minor_segments=across)
     ring = _object(mesh, WARM, 1.0, (-0.9, 0.35, 0.2), (0.05, -0.05, 0.0))
-    fine = edge < 1
-    return Problem(
-        [ring], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.72, nodes=2 if fine else 3
-    )
+    options = {"nodes": 2, "lines": 32} if edge < 1 else {}
+    return Problem([ring], eye=(0.4, 0.9, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.72, **options)
 
 
 def lattice() -> Problem:
@@ -527,33 +529,45 @@ def load(name) -> dict[str, np.ndarray]:
 
 def compute(problem) -> dict[str, np.ndarray]:
     """Return what is to be stored for a scene."""
-    jacobian, params = reference_jacobian(problem), target_params(problem)
-    residual = reference_image(problem) - reference_image(problem, params)
+    jacobian = reference_jacobian(problem)
     return {
         "projections": project(jacobian),
-        "target_image_params": params,
-        "l2_gradient": np.einsum("phwc,hwc->p", jacobian, residual),
+        "target_image_params": target_params(problem),
+        "l2_gradient": l2_gradient(jacobian, residual_of(problem)),
     }
 
 
+def residual_of(problem) -> np.ndarray:
+    """The image at rest less the target."""
+    return reference_image(problem) - reference_image(problem, target_params(problem))
+
+
+def l2_gradient(jacobian, residual) -> np.ndarray:
+    return np.einsum("phwc,hwc->p", jacobian, residual)
+
+
 def check(problem) -> None:
-    """Print how far the projections depend on the number of lines and on the step.
+    """Print how far what is stored depends on the number of lines and on the step.
 
     In proportion to those of the same group of parameters, and to those of all parameters in
     units of pixels: a smooth sphere, say, hardly changes when it turns.
     """
-    base = project(reference_jacobian(problem))
+    residual = residual_of(problem)
+
+    def stored(**options) -> dict[str, np.ndarray]:
+        jacobian = reference_jacobian(problem, **options)
+        return {"fields": project(jacobian), "L2": l2_gradient(jacobian, residual)[None]}
+
+    base, steps = stored(), step_sizes(problem)
     others = {
-        "twice the lines": project(reference_jacobian(problem, lines=64)),
-        "half the step": project(reference_jacobian(problem, step=STEP / 2)),
+        "twice the lines": stored(lines=2 * problem.lines),
+        "half the step": stored(step=STEP / 2),
     }
-    steps = step_sizes(problem)
-    whole = np.linalg.norm(base * steps)
-    for what, other in others.items():
-        for group, part in groups(problem).items():
-            error = np.linalg.norm((other - base)[:, part]) / np.linalg.norm(other[:, part])
-            share = np.linalg.norm(((other - base) * steps)[:, part]) / whole
-            print(f"  {what:16} {group:19} {error:.2e}, of all groups {share:.2e}", flush=True)
+    for (what, other), (group, part), key in product(others.items(), groups(problem).items(), base):
+        change = other[key] - base[key]
+        error = np.linalg.norm(change[:, part]) / np.linalg.norm(other[key][:, part])
+        share = np.linalg.norm((change * steps)[:, part]) / np.linalg.norm(base[key] * steps)
+        print(f"  {what:16} {key:6} {group:19} {error:.2e}, of all groups {share:.2e}", flush=True)
 
 
 def main() -> None:
