@@ -9,7 +9,7 @@ single call over that of a view among many. Also measured: the peak of memory, w
 chunk and not with the views; the gain of all cores over one; and that pictures and gradients have
 the same bits for chunks of 1, 3 and 16 views and on 1, 2, 4 and 8 devices, made of the CPU.
 
-Expected: on two cores a gain of 1.9 to 2.6 at 64 x 64 and of 1.5 to 2.8 at 256 x 256; a call for
+Expected: on two cores a gain of 1.9 to 2.6 at 64 x 64 and of 1.5 to 2.3 at 256 x 256; a call for
 one view takes one or two milliseconds more than `render`.
 
 Written to `--out`: `benchmark_views.json`, `.md` and `.png`. Ten minutes on two cores.
