@@ -10,7 +10,7 @@ import reference
 import scenes
 
 import diffrast as dr
-from diffrast import linalg, shapes
+from diffrast import deferred, linalg, shapes
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -415,3 +415,16 @@ def test_neither_of_two_bodies_shades_the_line_where_it_pierces_the_other():
     )
     image = dr.render(scene, camera, dr.RenderSettings(height=64, width=64))
     assert float(image.min()) > 0.59  # the cube's front, the least lit
+
+
+@pytest.mark.parametrize("very_large", [False, True])
+def test_large_pictures_are_shaded_as_small_ones(monkeypatch, very_large):
+    """Of the points that shadows fall on, or in batches which find these again."""
+    scene = dr.Scene(objects=[ball(), floor()], lights=[sun(), lamp((2, 4, 1))])
+    arguments = scene, ROUND_THE_CORNER, settings()
+    small = dr.render(*arguments)
+    monkeypatch.setattr(deferred, "LARGE", 0)
+    if very_large:
+        monkeypatch.setattr(deferred, "VERY_LARGE", 0)
+    large = jax.jit(lambda *arguments: dr.render.__wrapped__(*arguments))(*arguments)
+    np.testing.assert_allclose(large, small, atol=1e-6)
