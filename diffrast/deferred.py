@@ -22,7 +22,7 @@ from diffrast._stored import zero_after
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.geometry import Points, points_at, visible_points
 from diffrast.light import Columns
-from diffrast.raster.evaluate import Drawn, Pixels, carry, pixels_at
+from diffrast.raster.evaluate import Drawn, Pixels, carry, pixels_at, scaled
 from diffrast.shadows import Reached
 
 RUN = 32  # pixels
@@ -129,6 +129,7 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
+    drawn = drawn._replace(scaled=scaled(drawn.positions_clip))
     data, drawn, seen, parts, runs = varying_alike((data, drawn, seen, parts, runs))
     dtype = drawn.positions_clip.dtype
 

@@ -1,12 +1,14 @@
 """A scene as one mesh in the world, and the points of it that are seen."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float, Int
 
 from diffrast._stored import stored, stored_rows
@@ -14,20 +16,31 @@ from diffrast._topology import Edges, Topology, traced_topology
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
-from diffrast.linalg import mirrors, transform_normals, transform_points, where_finite
+from diffrast.linalg import (
+    apply_matrix,
+    mirrors,
+    norm,
+    normal_matrix,
+    transform_normals,
+    transform_points,
+    where_finite,
+)
 from diffrast.mesh import face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
 from diffrast.raster.evaluate import (
     Carried,
     Drawn,
     Pixels,
+    Placed,
+    Placement,
     Projection,
     all_pixels,
     evaluate,
 )
 from diffrast.raster.fragments import with_border
-from diffrast.scene import Scene
+from diffrast.scene import Object, Scene
 
+FEW_OBJECTS = 16  # what their transforms move is summed over the picture, for each of them
 _SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
 
 
@@ -71,10 +84,8 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
             faces_outward.append(turned)
             first_vertex += mesh.vertices.shape[0]
             if smooth:
-                own = mesh.normals
-                if own is None:
-                    own = vertex_normals(mesh.vertices, mesh.faces)
-                normals.append(where_finite(partial(transform_normals, item.transform), own))
+                turn = partial(transform_normals, item.transform)
+                normals.append(where_finite(turn, _own_normals(item)))
             if textured:
                 own = mesh.uvs
                 none = jnp.zeros_like(mesh.vertices[:, :2])
@@ -101,6 +112,60 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
         )
 
 
+def _own_normals(item: Object) -> Array:
+    mesh = item.mesh
+    return vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
+
+
+def _placed(scene: Scene, geometry: Geometry) -> Placed:
+    """Where objects come from, for derivatives by their transforms."""
+    placements, positions, normals, fixed = [], [], [], []
+    for item in scene.objects:
+        transform, vertices = item.transform, item.mesh.vertices
+        positions.append(where_finite(lambda points: points, vertices))
+        attributes = [_placed_by(transform_points, transform, vertices)]
+        turn = None
+        if geometry.normals is not None:
+            turn, own = normal_matrix(transform), _own_normals(item)
+            normals.append(where_finite(partial(_shortened, turn), own))
+            attributes.append(_placed_by(transform_normals, transform, own))
+        placements.append(Placement(transform[:3], turn))
+        fixed.append(attributes)
+    return Placed(
+        tuple(placements),
+        geometry.object_of_face,
+        stored_rows(jnp.concatenate(positions)),
+        stored_rows(jnp.concatenate(normals)) if normals else None,
+        tuple(stored_rows(jnp.concatenate(parts)) for parts in zip(*fixed, strict=True)),
+    )
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _placed_by(function: Callable[..., Array], transform: Array, vectors: Array) -> Array:
+    """What a transform makes of vectors, with their derivative and without its own."""
+    return where_finite(partial(function, transform), vectors)
+
+
+@partial(_placed_by.defjvp, symbolic_zeros=True)
+def _placed_derivative(
+    function: Callable[..., Array], primals: Any, tangents: Any
+) -> tuple[Array, Any]:
+    transform, vectors = primals
+    placed = _placed_by(
+        function, transform, vectors
+    )  # without the transform's derivative here, too
+    if isinstance(tangents[1], SymbolicZero):
+        return placed, SymbolicZero.from_primal_value(placed)
+    own = partial(where_finite, partial(function, transform))
+    return placed, jax.jvp(own, (vectors,), (tangents[1],))[1]
+
+
+def _shortened(matrix: Array, normals: Array) -> Array:
+    """Normals of which a matrix makes unit vectors."""
+    length = norm(apply_matrix(matrix, normals))[..., None]
+    return jnp.where(length > 0, normals / jnp.where(length > 0, length, 1), 0)
+
+
 def clip_positions(geometry: Geometry, camera: Camera) -> Float[Array, "V 4"]:
     """All vertices as the camera sees them."""
     with jax.named_scope("project"):
@@ -108,6 +173,7 @@ def clip_positions(geometry: Geometry, camera: Camera) -> Float[Array, "V 4"]:
 
 
 def draw(
+    scene: Scene,
     geometry: Geometry,
     camera: Camera,
     positions_clip: Array,
@@ -130,12 +196,14 @@ def draw(
     attributes = [geometry.positions]
     if geometry.normals is not None:
         attributes.append(geometry.normals)
-    projection = None
+    projection = placed = None
     if camera.distortion is None:
         matrix, pivot = pivoted_matrix(camera)
         seen_matrix = with_border(matrix.T, height, width, border).T
         projection = Projection(seen_matrix[np.array([0, 1, 3])], pivot)
-    return Drawn(seen_clip, geometry.faces, tuple(attributes), projection), face
+        if len(scene.objects) <= FEW_OBJECTS:
+            placed = _placed(scene, geometry)
+    return Drawn(seen_clip, geometry.faces, tuple(attributes), projection, placed), face
 
 
 def points_at(drawn: Drawn, pixels: Pixels, carried: Carried | None = None) -> Points:

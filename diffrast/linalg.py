@@ -242,12 +242,17 @@ def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "
     normal of the plane it flattens to, and a zero normal stays zero.
     """
     matrix, normals = _matrix_and_vectors(matrix, "normals", normals)
+    return normalize(apply_matrix(normal_matrix(matrix), normals))
+
+
+def normal_matrix(matrix: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
+    """What an affine matrix does to normals, but for their length."""
     linear = matrix[:3, :3]
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(linear)))
     a, b, c = (linear / jnp.where(largest > 0, largest, 1)).T
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     orientation = jnp.where(dot(a, cofactors[:, 0]) < 0, -1, 1)
-    return normalize(apply_matrix(orientation * cofactors, normals))
+    return orientation * cofactors
 
 
 def where_finite(function: Callable[[Array], Array], vectors: Array) -> Array:

@@ -107,6 +107,7 @@ def render(
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
     drawn, face = draw(  # a border of one pixel shows what lies beyond the edges there
+        scene,
         geometry,
         camera,
         clip,
@@ -116,7 +117,7 @@ def render(
         border=border,
     )
     with jax.named_scope("shade"):
-        bare = jax.lax.stop_gradient(drawn._replace(attributes=(), projection=None))
+        bare = jax.lax.stop_gradient(drawn._replace(attributes=(), projection=None, placed=None))
         pixels = visible_points(bare, face)  # if there are shadows
         world, reached = cast_shadows(scene, camera, geometry, pixels, settings.shading)
         world = world._replace(
@@ -164,7 +165,7 @@ def render_buffers(scene: Scene, camera: Camera, settings: RenderSettings) -> Bu
         return Buffers(nothing, nothing, three, three[..., 0], three, three, None, lit)
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
-    drawn = draw(geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
+    drawn = draw(scene, geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
     pixels = visible_points(*drawn)
     columns = normals_at(geometry, pixels)
     lighting = "flat" if settings.shading == "unlit" else settings.shading
@@ -216,7 +217,7 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     geometry = world_geometry(scene, settings.shading)
     clip = clip_positions(geometry, camera)
     size = settings.height, settings.width
-    drawn = draw(geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
+    drawn = draw(scene, geometry, camera, clip, *size, cull_backfaces=settings.cull_backfaces)
     pixels = visible_points(*drawn)
     lighting = "flat" if settings.shading == "unlit" else settings.shading
     world, reached = cast_shadows(scene, camera, geometry, pixels, lighting)

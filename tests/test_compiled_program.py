@@ -48,6 +48,10 @@ def gradient(given, part, options):
             if part == "texels":
                 material = dataclasses.replace(item.material, texture=value)
                 item = dataclasses.replace(item, material=material)
+            elif part == "vertices":
+                item = dataclasses.replace(
+                    item, mesh=dataclasses.replace(item.mesh, vertices=value)
+                )
             else:
                 item = dataclasses.replace(item, **{part: value})
             given = dataclasses.replace(given, objects=[item])
@@ -61,6 +65,7 @@ def gradient(given, part, options):
         "material": item.material,
         "texels": item.material.texture,
         "transform": item.transform,
+        "vertices": item.mesh.vertices,
     }[part]
     return jax.jit(jax.grad(loss)), (value, given, CAMERA)
 
@@ -115,15 +120,16 @@ def test_what_does_not_move_has_no_part_for_the_geometry(part, antialias):
     assert to_vertices(scene(material), part, settings(antialias=antialias)) == 0
 
 
-# A camera's motion is summed over the picture; that of vertices has the three corners' x, y and z,
-# for positions and for normals.
+# A camera's motion and that of few objects are summed over the picture; that of vertices has the
+# three corners' x, y and z, for positions and for normals.
 @pytest.mark.parametrize(
     ("part", "material", "columns"),
     [
         ("camera", {}, 0),
         ("camera", SHINY, 0),
-        ("transform", {}, 9 + 9),
-        ("transform", SHINY, 9 + 9),
+        ("transform", {}, 0),
+        ("transform", SHINY, 0),
+        ("vertices", SHINY, 9),  # the mesh has normals of its own
     ],
 )
 def test_a_motion_adds_up_only_what_it_moves(part, material, columns):

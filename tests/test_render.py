@@ -405,11 +405,11 @@ def test_a_gradient_in_lights_only_has_no_part_for_the_geometry():
     )
     camera = scenes.perspective()
 
-    def loss(lights, transform):
-        item = replace(scene.objects[0], transform=transform)
+    def loss(lights, vertices):
+        item = replace(scene.objects[0], mesh=replace(scene.objects[0].mesh, vertices=vertices))
         return jnp.sum(dr.render(replace(scene, objects=[item], lights=lights), camera, settings()))
 
-    arguments = scene.lights, scene.objects[0].transform
+    arguments = scene.lights, scene.objects[0].mesh.vertices
     counts = [operations(jax.jit(jax.grad(loss, n)), *arguments) for n in (0, 1)]
     to_vertices = [c["scatter", f"{VERTICES}xf32"] for c in counts]
     assert to_vertices[0] == 0

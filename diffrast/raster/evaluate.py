@@ -6,10 +6,12 @@ coordinate of corner 0, and so on in turn, for every sign of w. Nothing is divid
 
 When the point that a pixel sees moves with its face by (u, v) in these coordinates, the pixel sees
 another point of the face: sum X_i db_i = -u, sum Y_i db_i = -v, sum db_i = 0. So the derivative
-asks for the motion of one point a pixel. What a camera adds to it is summed over the picture, and
-only what vertices do on their own (`carry`) is collected by faces.
+asks for the motion of one point a pixel. What a camera adds to it, and the transforms of a few
+objects (`Placed`), is summed over the picture; only what vertices do on their own (`carry`) is
+collected by faces.
 """
 
+from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
 from typing import Any, NamedTuple, TypeAlias
@@ -33,6 +35,33 @@ class Projection(NamedTuple):
     pivot: Float[Array, "3"]  # not differentiable
 
 
+class Placement(NamedTuple):
+    """What an object's transform does."""
+
+    positions: Float[Array, "3 4"]
+    normals: Float[Array, "3 3"] | None  # before they are normalised; None without normals
+
+
+class Placed(NamedTuple):
+    """How world positions and normals, the first two attributes, come from those of the objects.
+
+    Derivatives are then taken by the placements and, for fixed ones, by the vertices.
+    """
+
+    placements: tuple[Placement, ...]  # of each object
+    object_of_face: Int[Array, " F"]
+    positions: Float[Array, "V 3"]  # of the objects
+    normals: Float[Array, "V 3"] | None  # of a length that placing them makes one
+    attributes: tuple[Float[Array, "V _"], ...]  # those drawn; placements have no derivative
+
+
+class Scaled(NamedTuple):
+    """Clip positions in units of about the largest of them, a power of two."""
+
+    columns: list[Float[Array, " V"]]  # x, y, w
+    unit: Float[Array, ""]
+
+
 class Drawn(NamedTuple):
     """What is drawn.
 
@@ -44,6 +73,8 @@ class Drawn(NamedTuple):
     faces: Int[Array, "F 3"]
     attributes: tuple[Float[Array, "V _"], ...] = ()
     projection: Projection | None = None
+    placed: Placed | None = None  # only with a projection
+    scaled: Scaled | None = None  # of the clip positions, if they are known already
 
 
 class Pixels(NamedTuple):
@@ -137,9 +168,10 @@ def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
 
     out = carry(drawn, pixels)
     clip = changes(change.positions_clip, out.clip, (0, 1, 3)) if out.clip else []
+    values = change.attributes if drawn.placed is None else change.placed.attributes
     attributes = tuple(
         changes(values, zeros, range(len(zeros)))
-        for values, zeros in zip(change.attributes, out.attributes, strict=True)
+        for values, zeros in zip(values, out.attributes, strict=True)
     )
     return out, Carried(clip, attributes)
 
@@ -150,7 +182,7 @@ def _evaluate(drawn: Drawn, pixels: Pixels, carried: Carried) -> Evaluated:
     seen = _see(drawn, pixels)
     columns = tuple(
         [blend(seen.barycentrics, corners) for corners in at_corners]
-        for at_corners in _at_corners(drawn, seen)
+        for at_corners in _at_corners(drawn.attributes, seen)
     )
     return Evaluated(seen.barycentrics, seen.inverse_depth, columns)
 
@@ -161,6 +193,9 @@ def _derivative(primals: Any, tangents: Any) -> tuple[Evaluated, Evaluated]:
     found = _evaluate(*primals)
     seen = _see(drawn, pixels)
     along = [None if isinstance(c[0], SymbolicZero) else c for c in carried.attributes]
+    if drawn.placed is not None:
+        moved = _moved(drawn, d_drawn.placed.placements, seen, pixels)
+        along = [_sum_of(own, other) for own, other in zip(along, moved, strict=True)]
     if drawn.projection is not None:
         motion = _projected(drawn.projection, d_drawn.projection, found.attributes[0], along[0])
     else:
@@ -174,7 +209,7 @@ def _derivative(primals: Any, tangents: Any) -> tuple[Evaluated, Evaluated]:
     approach = motion[2] + d1 * (seen.w[1] - seen.w[0]) + d2 * (seen.w[2] - seen.w[0])
     inverse = found.inverse_depth
     changes = []
-    for own, at_corners in zip(along, _at_corners(drawn, seen), strict=True):
+    for own, at_corners in zip(along, _at_corners(drawn.attributes, seen), strict=True):
         slid = [d1 * (second - first) + d2 * (third - first) for first, second, third in at_corners]
         changes.append(slid if own is None else [a + b for a, b in zip(own, slid, strict=True)])
     d_inverse_depth = -inverse * (inverse * seen.unit) * approach
@@ -183,7 +218,7 @@ def _derivative(primals: Any, tangents: Any) -> tuple[Evaluated, Evaluated]:
 
 def _see(drawn: Drawn, pixels: Pixels) -> _Seen:
     corners = corners_at(drawn.faces, pixels.face)
-    (x_vertex, y_vertex, w_vertex), unit = _scaled_columns(drawn.positions_clip)
+    (x_vertex, y_vertex, w_vertex), unit = drawn.scaled or scaled(drawn.positions_clip)
     w = [w_vertex[corner] for corner in corners]
     x = [_offset(x_vertex[corners[j]], w[j], pixels.width, pixels.x) for j in range(3)]
     y = [_offset(y_vertex[corners[j]], w[j], pixels.height, pixels.y) for j in range(3)]
@@ -202,12 +237,63 @@ def _see(drawn: Drawn, pixels: Pixels) -> _Seen:
     return _Seen(corners, x, y, w, unit, inverse_total, barycentrics, inverse_depth)
 
 
-def _at_corners(drawn: Drawn, seen: _Seen) -> list[list[Columns]]:
+def _at_corners(attributes: tuple[Array, ...], seen: _Seen) -> list[list[Columns]]:
     """For each attribute, for each of its columns, the values at the three corners."""
     return [
         [[values[:, c][corner] for corner in seen.corners] for c in range(values.shape[1])]
-        for values in drawn.attributes
+        for values in attributes
     ]
+
+
+def _moved(
+    drawn: Drawn, changes: tuple[Placement, ...], seen: _Seen, pixels: Pixels
+) -> list[Columns | None]:
+    """How world position and normal of fixed points change as objects are placed elsewhere."""
+    placed, b = drawn.placed, seen.barycentrics
+    assert placed is not None
+    own_object = jnp.where(pixels.face >= 0, placed.object_of_face[jnp.maximum(pixels.face, 0)], -1)
+
+    def of_each(matrices: list[Any], change_by: Callable[[Array], Columns]) -> Columns | None:
+        """The change by the matrix of the object that a pixel sees, of those that change."""
+        columns = None
+        for number, matrix in enumerate(matrices):
+            if not isinstance(matrix, SymbolicZero):
+                here = own_object == number
+                others = columns or [jnp.zeros_like(seen.inverse_depth)] * 3
+                parts = zip(change_by(matrix), others, strict=True)
+                columns = [jnp.where(here, part, other) for part, other in parts]
+        return columns and stored(columns, seen.inverse_depth)
+
+    (at_corners,) = _at_corners((placed.positions,), seen)
+    position = stored([blend(b, corners) for corners in at_corners])
+    moved = [
+        of_each(
+            [change.positions for change in changes],
+            lambda matrix: [_along(row, position) + row[3] for row in matrix],
+        )
+    ]
+    if placed.normals is None:
+        return moved
+    own, normals = stored(_at_corners((placed.normals, drawn.attributes[1]), seen))
+    shares = stored([[b[j] * column[j] for column in own] for j in range(3)])
+
+    def turned(matrix: Array) -> Columns:
+        """Of a unit vector only the change across it is left."""
+        parts = []
+        for j in range(3):
+            change = stored([_along(row, shares[j]) for row in matrix], seen.inverse_depth)
+            normal = [column[j] for column in normals]
+            length = _along(change, normal)
+            parts.append([c - length * n for c, n in zip(change, normal, strict=True)])
+        return [reduce(add, column) for column in zip(*parts, strict=True)]
+
+    return [*moved, of_each([change.normals for change in changes], turned)]
+
+
+def _sum_of(*parts: Columns | None) -> Columns | None:
+    """Columns added up; None of nothing."""
+    known = [part for part in parts if part is not None]
+    return [reduce(add, columns) for columns in zip(*known, strict=True)] or None
 
 
 def _projected(
@@ -220,10 +306,10 @@ def _projected(
         terms.append([_along(row, relative) + row[3] for row in change.matrix])
     if carried is not None:
         terms.append([_along(row, carried) for row in projection.matrix])
-    return [reduce(add, parts) for parts in zip(*terms, strict=True)] or None
+    return _sum_of(*terms)
 
 
-def _along(row: Array, vector: Columns) -> Array:
+def _along(row: Array | Columns, vector: Columns) -> Array:
     return row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2]
 
 
@@ -247,17 +333,17 @@ def corners_at(faces: Int[Array, "F 3"], face: Int[Array, "*size"]) -> list[Int[
     return [faces[:, j][visible] for j in range(3)]
 
 
-def _scaled_columns(positions_clip: Array) -> tuple[list[Array], Array]:
-    """Columns x, y, w in units of about the largest of them, so that products stay in range.
+def scaled(positions_clip: Float[Array, "V 4"]) -> Scaled:
+    """Clip positions in units in which products stay in range.
 
-    The unit, also returned, is a power of two: the division rounds nothing. Positions that are not
-    finite become zero: no visible face has them, but the background evaluates face 0.
+    The unit is a power of two: the division rounds nothing. Positions that are not finite become
+    zero: no visible face has them, but the background evaluates face 0.
     """
     finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
     columns = [jnp.where(finite, positions_clip[:, i], 0) for i in (0, 1, 3)]
     largest = jnp.max(jnp.abs(lax.stop_gradient(jnp.stack(columns))))
     unit = jnp.ldexp(jnp.ones_like(largest), jnp.frexp(largest)[1] - 1)
-    return [column / unit for column in columns], unit
+    return Scaled([column / unit for column in columns], unit)
 
 
 def _offset(numerator: Array, w: Array, size: Array, centre: Array) -> Array:
