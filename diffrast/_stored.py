@@ -27,11 +27,36 @@ def stored(values: T, witness: Array | None = None) -> T:
     def store(value: Array) -> Array:
         if value.dtype == bool:
             return value
-        same = lax.stop_gradient(value if witness is None else witness)
-        is_number = (same < 0) | (same >= 0) | (same != same)
-        return lax.div(value, jnp.where(is_number, 1, 2).astype(value.dtype))
+        if witness is not None:
+            return lax.div(value, _one(witness, value.dtype))
+        return (
+            _stored_number(value) if jnp.issubdtype(value.dtype, jnp.inexact) else _divided(value)
+        )
 
     return jax.tree.map(store, values)
+
+
+def _one(witness: Array, dtype: jnp.dtype) -> Array:
+    """A one that XLA takes for another number until it has fused."""
+    same = lax.stop_gradient(witness)
+    is_number = (same < 0) | (same >= 0) | (same != same)
+    return jnp.where(is_number, 1, 2).astype(dtype)
+
+
+def _divided(value: Array) -> Array:
+    return lax.div(value, _one(value, value.dtype))
+
+
+@jax.custom_jvp
+def _stored_number(value: Array) -> Array:
+    return _divided(value)
+
+
+@_stored_number.defjvp
+def _stored_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """The one is made of what is stored: of the value itself all of it would be computed again."""
+    found = _stored_number(*primals)
+    return found, lax.div(tangents[0], _one(found, found.dtype))
 
 
 def zero_after(witness: Array) -> Array:

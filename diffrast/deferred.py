@@ -18,7 +18,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Int
 
 from diffrast._selection import compacted
-from diffrast._stored import zero_after
+from diffrast._stored import stored, zero_after
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.geometry import Points, points_at, visible_points
 from diffrast.light import Columns
@@ -26,7 +26,7 @@ from diffrast.raster.evaluate import Drawn, Pixels, carry, pixels_at, scaled
 from diffrast.shadows import Reached
 
 RUN = 32  # pixels
-RUNS_AT_ONCE = 512
+RUNS_AT_ONCE = 1024
 LARGE = 90_000  # pixels: what smaller images need is fast to store
 VERY_LARGE = 5 << 16  # pixels: the same without a derivative
 
@@ -137,7 +137,8 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
         number = chosen[..., None] * RUN + jnp.arange(RUN)
         number = number.reshape(*chosen.shape[:-1], -1)
         own = seen.at[chosen].get(mode="fill", fill_value=-1).reshape(number.shape)
-        return pixels_at(own, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
+        pixels = pixels_at(own, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
+        return pixels._replace(x=stored(pixels.x), y=stored(pixels.y))
 
     chosen = runs.chosen.reshape(-1, RUNS_AT_ONCE)
     carried = carry(drawn, pixels_of(chosen)) if many else None

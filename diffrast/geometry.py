@@ -1,7 +1,7 @@
 """A scene as one mesh in the world, and the points of it that are seen."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -294,11 +294,26 @@ def apart_edges(geometry: Geometry, edges: Edges, shading: str) -> Array:
         return jnp.ones_like(edges.seam)
     if geometry.normals is None:
         return jnp.zeros_like(edges.seam)
-    differs = jnp.zeros_like(edges.seam)
+    normals = jax.lax.stop_gradient(geometry.normals)
+    seams = edges.seam, edges, normals, geometry.faces
+    return jax.lax.cond(jnp.any(edges.seam), _bent_seams, lambda seam, *_: seam, *seams)
+
+
+def _bent_seams(seam: Array, edges: Edges, normals: Array, faces: Array) -> Array:
+    """Those seams on whose sides the normals at the same place differ."""
+    differs = jnp.zeros_like(seam)
     for k in range(2):
         corner = edges.corners // 3 if k == 0 else edges.corners % 3
-        vertex = [geometry.faces[jnp.maximum(edges.faces[:, i], 0), corner[:, i]] for i in range(2)]
-        one, other = (geometry.normals[v] for v in vertex)
-        largest = jnp.max(jnp.abs(one), axis=1) + jnp.max(jnp.abs(other), axis=1)
-        differs = differs | (jnp.max(jnp.abs(one - other), axis=1) > _SAME_NORMAL * largest)
-    return edges.seam & differs
+        one, other = (
+            [normals[:, c][vertex] for c in range(3)]
+            for vertex in (faces[jnp.maximum(edges.faces[:, i], 0), corner[:, i]] for i in range(2))
+        )
+        size = _largest(one) + _largest(other)
+        apart = _largest([a - b for a, b in zip(one, other, strict=True)])
+        differs = differs | (apart > _SAME_NORMAL * size)
+    return seam & differs
+
+
+def _largest(columns: Columns) -> Array:
+    """The largest size of the components."""
+    return reduce(jnp.maximum, map(jnp.abs, columns))

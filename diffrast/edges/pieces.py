@@ -128,7 +128,8 @@ def _sides(edges: Edges, volume: Array) -> tuple[Array, Array, Array]:
     face = jnp.maximum(edges.faces.T, 0)
     drawn = (edges.faces.T >= 0) & (volume[face] != 0)
     corners = edges.corners.T
-    right = (volume[face] < 0) == ((corners // 3 + 1) % 3 == corners % 3)
+    around = (corners == 1) | (corners == 5) | (corners == 6)  # 3 i + j with j next to i
+    right = (volume[face] < 0) == around
     return drawn, right, (drawn[0] != drawn[1]) | (right[0] == right[1])
 
 
