@@ -19,7 +19,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import batches_of, over_batches, prefix_sum
-from diffrast._stored import stored
+from diffrast._stored import assemble, stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import blocks_with_background
 from diffrast.edges.pieces import (
@@ -323,7 +323,7 @@ def _shade(
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = jnp.stack(method.shader(view.scene, face, barycentrics), axis=-1)
+    colors = assemble(stored(method.shader(view.scene, face, barycentrics)))
     return jnp.split(colors, len(points))
 
 
@@ -411,7 +411,7 @@ def _with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Bl
     assert method.glow is not None
     assert view.cast is not None
     area = _area(line.begin, line.end)
-    glow = jnp.stack(method.glow(view.scene, line.light, line.face, line.barycentrics), axis=-1)
+    glow = assemble(stored(method.glow(view.scene, line.light, line.face, line.barycentrics)))
     jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
     own = view.image.reshape(-1, view.image.shape[2])[_place(view, line.pixel, 4)]
     to_other = jnp.where(line.centre_is_lit, -1, 1)[:, None] * glow
