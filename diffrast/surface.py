@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from diffrast._stored import stored
+from diffrast._stored import assemble, stored
 from diffrast._topology import Topology
 from diffrast.camera import Camera, direction_to_clip, viewpoint, world_to_clip
 from diffrast.edges import Cast
@@ -145,7 +145,7 @@ def _shade_gouraud(world: World, points: Points, reached: Reached) -> Columns:
         to_viewer = _to_viewer(world, position) if with_viewer else None
         distance = _viewer_distance(scene.lights, camera, position)
         surface = Surface(normal, position, to_viewer, distance)
-        return jnp.stack(phong(surface, reflectance, lights), axis=-1)
+        return assemble(stored(phong(surface, reflectance, lights)))
 
     def at_vertices(lights: tuple[Light, ...]) -> Columns:
         if texel is None:
