@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from diffrast._stored import stored, stored_rows
 from diffrast._topology import Edges, Topology, traced_topology
+from diffrast._varying import varying_zero
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
@@ -151,9 +152,7 @@ def _placed_derivative(
     function: Callable[..., Array], primals: Any, tangents: Any
 ) -> tuple[Array, Any]:
     transform, vectors = primals
-    placed = _placed_by(
-        function, transform, vectors
-    )  # without the transform's derivative here, too
+    placed = _placed_by(function, transform, vectors)  # whose derivative, again, is this one
     if isinstance(tangents[1], SymbolicZero):
         return placed, SymbolicZero.from_primal_value(placed)
     own = partial(where_finite, partial(function, transform))
@@ -294,14 +293,17 @@ def apart_edges(geometry: Geometry, edges: Edges, shading: str) -> Array:
         return jnp.ones_like(edges.seam)
     if geometry.normals is None:
         return jnp.zeros_like(edges.seam)
-    normals = jax.lax.stop_gradient(geometry.normals)
-    seams = edges.seam, edges, normals, geometry.faces
-    return jax.lax.cond(jnp.any(edges.seam), _bent_seams, lambda seam, *_: seam, *seams)
+    seams = edges, jax.lax.stop_gradient(geometry.normals), geometry.faces
+    return jax.lax.cond(jnp.any(edges.seam), _bent_seams, _no_seams, *seams)
 
 
-def _bent_seams(seam: Array, edges: Edges, normals: Array, faces: Array) -> Array:
+def _no_seams(edges: Edges, normals: Array, faces: Array) -> Array:
+    return jnp.zeros_like(edges.seam) | (varying_zero((edges, normals, faces)) != 0)
+
+
+def _bent_seams(edges: Edges, normals: Array, faces: Array) -> Array:
     """Those seams on whose sides the normals at the same place differ."""
-    differs = jnp.zeros_like(seam)
+    differs = _no_seams(edges, normals, faces)
     for k in range(2):
         corner = edges.corners // 3 if k == 0 else edges.corners % 3
         one, other = (
@@ -311,7 +313,7 @@ def _bent_seams(seam: Array, edges: Edges, normals: Array, faces: Array) -> Arra
         size = _largest(one) + _largest(other)
         apart = _largest([a - b for a, b in zip(one, other, strict=True)])
         differs = differs | (apart > _SAME_NORMAL * size)
-    return seam & differs
+    return edges.seam & differs
 
 
 def _largest(columns: Columns) -> Array:

@@ -236,18 +236,18 @@ def transform_directions(matrix: ArrayInput, directions: ArrayInput) -> Float[Ar
 
 
 def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "*batch 3"]:
-    """Unit normals (..., 3) of surfaces that an affine 4x4 matrix moves.
-
-    Equals the normalised inverse transpose, by cofactors: a matrix that flattens space gives the
-    normal of the plane it flattens to, and a zero normal stays zero.
-    """
+    """Unit normals (..., 3) of surfaces that an affine 4x4 matrix moves; a zero one stays zero."""
     matrix, normals = _matrix_and_vectors(matrix, "normals", normals)
     return normalize(apply_matrix(normal_matrix(matrix), normals))
 
 
-def normal_matrix(matrix: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
-    """What an affine matrix does to normals, but for their length."""
-    linear = matrix[:3, :3]
+def normal_matrix(matrix: ArrayInput) -> Float[Array, "3 3"]:
+    """What an affine 4x4 matrix does to normals, but for their length. Differentiable.
+
+    A multiple of the inverse transpose, by cofactors: a matrix that flattens space gives normals of
+    the plane it flattens to.
+    """
+    linear = float_array("matrix", matrix, (4, 4), finite=False)[:3, :3]
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(linear)))
     a, b, c = (linear / jnp.where(largest > 0, largest, 1)).T
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)

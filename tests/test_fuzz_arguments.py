@@ -303,6 +303,7 @@ def cases(folder):
         "linalg.so3_exp": {"rotation_vector": POINTS[1]},
         "linalg.so3_log": {"matrix": np.eye(3)},
         "linalg.transform_directions": {"matrix": EYE4, "directions": POINTS},
+        "linalg.normal_matrix": {"matrix": EYE4},
         "linalg.transform_normals": {"matrix": EYE4, "normals": POINTS},
         "linalg.transform_points": {"matrix": EYE4, "points": POINTS},
         "linalg.translation": {"offset": POINTS[1]},

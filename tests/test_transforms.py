@@ -129,3 +129,19 @@ def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
     np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
     assert np.all(np.isfinite(products))
     assert np.all(np.any(products != 0, axis=1))
+
+
+def test_shard_map_of_scan_of_grad_by_transforms():
+    """With edges, of a mesh with seams and one without, of which only one moves."""
+    cube = dr.mesh.flat_shaded(dr.shapes.cube())
+
+    def loss(offset):
+        objects = [dr.Object(MESH, None, dr.linalg.translation(offset)), dr.Object(cube)]
+        scene = dr.Scene(objects=objects, lights=SCENE.lights)
+        return jnp.mean(dr.render(scene, camera(EYES[0]), dr.RenderSettings(**SIZE)) ** 2)
+
+    of_all = sharded(lambda offsets: jax.lax.map(jax.grad(loss), offsets))
+    gradients = of_all(EYES[:2] / 4)
+    mapped = jax.jit(jax.vmap(jax.grad(loss)))(EYES[:2] / 4)
+    np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
+    assert np.all(np.any(gradients != 0, axis=1))
