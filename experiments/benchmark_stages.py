@@ -66,7 +66,7 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
     scene = dr.Scene(objects=[dr.Object(mesh, material)], lights=[light])
     geometry = world_geometry(scene, "phong")
     clip = clip_positions(geometry, camera)
-    points = visible_points(*draw(geometry, camera, clip, size, size, cull_backfaces=False))
+    points = visible_points(*draw(scene, geometry, camera, clip, size, size, cull_backfaces=False))
     fragments = dr.rasterize(clip, mesh.faces, height=size, width=size)
     covered = check(clip, mesh.faces, fragments) * size**2
     vertices, faces, pixels = mesh.vertices.shape[0], mesh.faces.shape[0], float(size**2)
