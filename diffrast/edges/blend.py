@@ -323,7 +323,7 @@ def _shade(
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = assemble(stored(method.shader(view.scene, face, barycentrics)))
+    colors = assemble(method.shader(view.scene, face, barycentrics))
     return jnp.split(colors, len(points))
 
 
