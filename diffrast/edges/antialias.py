@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import Glow, Method, Shader, Sums, View, collect
+from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View, collect
 from diffrast.edges.derivative import apply_linear, linear_zeros
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -153,7 +153,9 @@ def antialias_image(
         positions_clip = jnp.concatenate([positions_clip, rows])
         view = view._replace(cast=cast)
     view = view._replace(positions_clip=positions_clip, scale=scale)
-    gather = jax.custom_batching.sequential_vmap(lambda view: collect(view, method))
+
+    def gather(view: View, method: Method) -> Blended:
+        return jax.custom_batching.sequential_vmap(lambda view: collect(view, method))(view)
 
     def with_edges(image: Array, sums: Sums) -> Array:
         added, low, high = (
@@ -164,7 +166,7 @@ def antialias_image(
     @jax.custom_jvp
     def blended(image: Array, positions_clip: Array, rest: View) -> Array:
         now = rest._replace(image=image, positions_clip=positions_clip)
-        return with_edges(image, gather(now).sums)
+        return with_edges(image, gather(now, method._replace(capacity=0)).sums)
 
     def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
         image, positions_clip, rest = primals
@@ -174,7 +176,9 @@ def antialias_image(
         if isinstance(d_clip, SymbolicZero):
             d_clip = linear_zeros(positions_clip.shape, d_image)
         now = lax.stop_gradient(rest._replace(image=image, positions_clip=positions_clip))
-        records, sums = gather(now)
+        records, sums = gather(now, method)
+        assert records is not None
+        assert sums is not None
         x, y, _, w = to_pixels(d_clip, height, width)
         points = jnp.stack([x, y, w], axis=-1)
         colors = d_image.reshape(-1, channels)

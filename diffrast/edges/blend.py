@@ -94,7 +94,7 @@ class Method(NamedTuple):
             colours of pixels beside the edge instead.
         glow: what one light adds to the colours, `glow(scene, light, face, barycentrics)`.
         cull_backfaces: whether only front faces are drawn.
-        capacity: rows of the records.
+        capacity: rows of the records; 0 for a picture alone, of which nothing is recorded.
     """
 
     shader: Shader | None
@@ -108,13 +108,13 @@ class Sums(NamedTuple):
 
     added: Float[Array, "pixels channels"]
     range: tuple[Array, Array]  # least and greatest colours that each pixel holds
-    rims: Float[Array, " pixels_with_border"]  # length of smooth rims about a pixel's centre
+    rims: Float[Array, " pixels_with_border"] | None  # length of smooth rims about pixels' centres
 
 
 class Blended(NamedTuple):
-    """The pieces, and what they add up to; None where only records are asked for."""
+    """The pieces, and what they add up to; None of what is not asked for."""
 
-    records: Records
+    records: Records | None
     sums: Sums | None
 
 
@@ -175,6 +175,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
         volume = stored(jnp.where(front, volume, 0))
 
     def is_wanted(total: Blended) -> Array:
+        assert total.records is not None
         return has_room(total.records)
 
     goes_on = None if start is None else is_wanted
@@ -190,8 +191,8 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     for order, size, at_once, add in work:
 
         def add_batch(indices: Array, exists: Array, total: Blended, add: Add = add) -> Blended:
-            total = add(indices, exists, total)
-            return total._replace(records=after_batch(total.records))
+            records, sums = add(indices, exists, total)
+            return Blended(records and after_batch(records), sums)
 
         first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
         blended = over_batches(
@@ -300,11 +301,14 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
 def _nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
     channels, dtype = view.image.shape[2], view.image.dtype
-    records = no_records(method.capacity, channels, dtype, start, zero)
+    records = rims = None
+    if method.capacity:
+        records = no_records(method.capacity, channels, dtype, start, zero)
+        rims = jnp.zeros(view.face_image.size, dtype) + zero
     if start is not None:
         return Blended(records, None)
-    own, rims = cropped(view.image, view.image.shape), jnp.zeros(view.face_image.size, dtype)
-    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims + zero))
+    own = cropped(view.image, view.image.shape)
+    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
@@ -374,7 +378,7 @@ def _with_pieces(
     held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
     rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
-    if sums is not None:
+    if sums is not None and sums.rims is not None:
         sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
     start, end = segments.vertices[:, pieces.segment]
     rows = (

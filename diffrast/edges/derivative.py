@@ -50,6 +50,7 @@ def _over_pieces(
     def step(state: tuple[Array, Start, Any]) -> tuple[Array, Start, Any]:
         which, start, total = state
         found = collect(view, method, start).records
+        assert found is not None
         branches = [lambda total, add=add: _over_rows(found, add, total) for add in adds]
         total = lax.switch(which, branches, total)
         ended = found.following.row >= records.total

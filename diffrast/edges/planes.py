@@ -50,16 +50,23 @@ def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) 
     return stored(pixels[jnp.array([0, 1, 3])][:, stored(faces.T[:, jnp.maximum(face, 0)])])
 
 
-def edge_values(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
+def edge_values(
+    corners: Array, x: Array, y: Array, near: tuple[Array, Array] | None = None
+) -> tuple[Columns, Array]:
     """Three values that are positive inside of faces and linear on the screen, and 1/w.
 
     1/w is -1 on faces seen edge-on. Multiplied by what they add up to, barycentric coordinates
-    become the values, up to one sign.
+    become the values, up to one sign. Where many points lie `near` one, as far as rounding is
+    concerned, the faces' volume is found there, and once.
     """
     e, volume = edge_functions(corners, x, y)
+    if near is not None:
+        volume = stored(edge_functions(corners, *near)[1])
     sign = jnp.where(volume < 0, -1, 1)
-    depth = jnp.where(volume == 0, -1, (e[0] + e[1] + e[2]) / jnp.where(volume == 0, 1, volume))
-    return stored(([value * sign for value in e], depth))
+    values = stored([value * sign for value in e])
+    total = values[0] + values[1] + values[2]
+    depth = jnp.where(volume == 0, -1, total / jnp.where(volume == 0, 1, abs(volume)))
+    return values, stored(depth)
 
 
 def edge_functions(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:

@@ -74,8 +74,12 @@ def after_batch(records: Records) -> Records:
     return records._replace(batch=batch, following=following)
 
 
-def with_rows(records: Records, used: Array, rows: tuple[Array, ...]) -> Records:
-    """Write rows behind those in use, as far as there is room."""
+def with_rows(
+    records: Records | None, used: Array, rows: tuple[Array, ...]
+) -> Records | None:
+    """Write rows behind those in use, as far as there is room; None where nothing is recorded."""
+    if records is None:
+        return None
     capacity = records.jump.shape[0]
     ends = prefix_sum(used.astype(jnp.int32))
     slot = records.total + ends - 1 - records.row
@@ -94,7 +98,7 @@ def with_rows(records: Records, used: Array, rows: tuple[Array, ...]) -> Records
 
 
 def with_lines(
-    records: Records,
+    records: Records | None,
     used: Array,
     pixel: Array,
     places: list[Array],
@@ -102,7 +106,7 @@ def with_lines(
     area: Array,
     vertices: Array,
     motion: Array,
-) -> Records:
+) -> Records | None:
     """Record lines that move with more vertices, as several rows each: two in every row."""
     rows = [
         (

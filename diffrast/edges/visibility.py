@@ -104,11 +104,14 @@ def uncovered(
     sides = jnp.stack([-aside, aside])
     x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
     y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
-    values, depth = edge_values(corners_of(face, faces, pixels)[:, :, None, None], *stored((x, y)))
+    x, y = stored((x, y))
+    corners = corners_of(face, faces, pixels)[:, :, None, None]
+    values, depth = edge_values(corners, x, y, near=(x[0, 0], y[0, 0]))
     own_depth = weights[0] + pieces.range * (weights[1] - weights[0])
     before = covers(values) & (depth > own_depth * (1 + FINE_TOLERANCE))
+    before = stored(before.astype(jnp.int32)).reshape(4, -1)  # a reduction would be no vector code
     foreign = (face >= 0) & (face != own[0]) & (face != own[1])
-    hidden = foreign & jnp.all(before, axis=(0, 1))
+    hidden = foreign & ((before[0] & before[1] & before[2] & before[3]) > 0)
     return pieces._replace(exists=pieces.exists & ~hidden)
 
 
@@ -172,7 +175,8 @@ def look(
     offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
-    values, depth = edge_values(corners_of(around, faces, pixels)[:, :, None, None], *points)
+    around_corners = corners_of(around, faces, pixels)[:, :, None, None]
+    values, depth = edge_values(around_corners, *points, near=tuple(stored(centre)))
     patch = stored(topology.patches[jnp.maximum(around, 0)])
     fine = jnp.min(area(face_corners), axis=0) < _FINE
     front_patch = stored(topology.patches[jnp.maximum(front, 0)])
