@@ -89,3 +89,11 @@ def assemble(channels: list[Array]) -> Array:
     for c, channel in enumerate(channels):
         image = image.at[..., c].set(channel)
     return image
+
+
+def assemble_rows(rows: list[Array]) -> Array:
+    """Stack rows along a new first axis, each computed once."""
+    table = jnp.zeros((len(rows), *rows[0].shape), rows[0].dtype)
+    for r, row in enumerate(rows):
+        table = table.at[r].set(row)
+    return table

@@ -157,7 +157,8 @@ def antialias_image(
     def gather(view: View, method: Method) -> Blended:
         return jax.custom_batching.sequential_vmap(lambda view: collect(view, method))(view)
 
-    def with_edges(image: Array, sums: Sums) -> Array:
+    def with_edges(image: Array, sums: Sums | None) -> Array:
+        assert sums is not None
         added, low, high = (
             part.reshape(height, width, channels) for part in (sums.added, *sums.range)
         )
@@ -179,6 +180,7 @@ def antialias_image(
         records, sums = gather(now, method)
         assert records is not None
         assert sums is not None
+        assert sums.rims is not None
         x, y, _, w = to_pixels(d_clip, height, width)
         points = jnp.stack([x, y, w], axis=-1)
         colors = d_image.reshape(-1, channels)

@@ -10,7 +10,8 @@ which adds up exactly over the pieces of any outline. To first order dS is minus
 times the motion of its middle: linear in the positions, without a singularity.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import batches_of, over_batches, prefix_sum
-from diffrast._stored import assemble, stored
+from diffrast._stored import assemble_rows, stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import blocks_with_background
 from diffrast.edges.pieces import (
@@ -316,9 +317,14 @@ def _place(view: View, pixel: Array, look: Array | int) -> Array:
     return (pixel[1] + look // 3) * view.image.shape[1] + pixel[0] + look % 3
 
 
+def _colors(view: View, place: Int[Array, " n"]) -> Float[Array, "channels n"]:
+    """What the image shows there."""
+    return view.image.reshape(-1, view.image.shape[2])[place].T
+
+
 def _shade(
     view: View, method: Method, *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]]
-) -> list[Array]:
+) -> list[Float[Array, "channels n"]]:
     """Colours of points on faces, several of each piece at once."""
     assert method.shader is not None
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
@@ -327,8 +333,8 @@ def _shade(
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = assemble(method.shader(view.scene, face, barycentrics))
-    return jnp.split(colors, len(points))
+    colors = assemble_rows(method.shader(view.scene, face, barycentrics))
+    return jnp.split(colors, len(points), axis=1)
 
 
 def _with_pieces(
@@ -341,41 +347,38 @@ def _with_pieces(
 ) -> Blended:
     """Add pieces of edges."""
     rim = found.rim
-    flat = view.image.reshape(-1, view.image.shape[2])
     looks = (found.front.look, found.beyond.look, rim.inner)
     places = [_place(view, pieces.pixel, look) for look in looks]
-    near, behind, inner = stored([flat[i] for i in places])
-    bare = view.background
-    if bare.ndim > 1:
-        bare = bare.reshape(flat.shape)[_place(view, pieces.pixel, 4)]
-    behind = jnp.where((found.beyond.face == BACKGROUND)[:, None], bare, behind)
+    near, behind, inner = stored([_colors(view, place) for place in places])
+    bare = view.background[:, None]
+    if bare.ndim > 2:
+        own_place = _place(view, pieces.pixel, 4)
+        bare = view.background.reshape(-1, view.image.shape[2])[own_place].T
+    behind = jnp.where(found.beyond.face == BACKGROUND, bare, behind)
     front = near
     outward = jnp.where(found.front_on_right, -1, 1)
-    area = outward * _area(found.begin, found.end)
-    length = jnp.hypot(found.end[0] - found.begin[0], found.end[1] - found.begin[1])
+    across = found.end - found.begin
+    area, length = outward * _area(found.begin, found.end), jnp.hypot(*across)
+    area, length = stored((area, length))
     smooth = jnp.zeros_like(found.visible)
     if method.shader is None:
         jump = behind - front
-        value = area[:, None] * jump
+        value = area * jump
     else:
         points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
         front, beyond, bend, far, beside = _shade(view, method, *points)
-        behind = jnp.where(found.beyond.face[:, None] >= 0, beyond, behind)
+        behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
-        jump = behind - jnp.where(smooth[:, None], moved, front)
-        mean = integral - rim.depth[:, None] * near
-        value = jnp.where(
-            smooth[:, None],
-            area[:, None] * (behind - near) + length[:, None] * mean,
-            area[:, None] * jump,
-        )
-        own = flat[_place(view, pieces.pixel, 4)]
-        value = jnp.where(found.wrong_side[:, None], value + front - own, value)
+        jump = behind - jnp.where(smooth, moved, front)
+        mean = integral - rim.depth * near
+        value = jnp.where(smooth, area * (behind - near) + length * mean, area * jump)
+        own = _colors(view, _place(view, pieces.pixel, 4))
+        value = jnp.where(found.wrong_side, value + front - own, value)
     jump, value, front, behind = stored((jump, value, front, behind))
-    size = jnp.max(jnp.abs(behind) + jnp.abs(front), axis=1)
-    used = found.visible & (found.fold | (jnp.max(jnp.abs(jump), axis=1) > _NO_JUMP * size))
-    held = jnp.stack([front, behind, jnp.where(smooth[:, None], inner, front)])
+    size = reduce(jnp.maximum, jnp.abs(behind) + jnp.abs(front))
+    used = found.visible & (found.fold | (reduce(jnp.maximum, jnp.abs(jump)) > _NO_JUMP * size))
+    held = front, behind, jnp.where(smooth, inner, front)
     rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
     if sums is not None and sums.rims is not None:
@@ -383,7 +386,7 @@ def _with_pieces(
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),
-        jump,
+        jump.T,
         jnp.stack([area, rim_length], axis=-1),
         stored(outward * _motion(segments, pieces, found)).T,
     )
@@ -392,21 +395,20 @@ def _with_pieces(
 
 def _with_line(total: Blended, view: View, method: Method, line: Line) -> Blended:
     """Add lines where surfaces pierce each other."""
-    area = _area(line.begin, line.end)
+    area = stored(_area(line.begin, line.end))
     places = [_place(view, line.pixel, look) for look in line.look]
     if method.shader is None:
-        right, left = (view.image.reshape(-1, view.image.shape[2])[i] for i in places)
+        right, left = stored([_colors(view, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
         right, left = _shade(view, method, *points)
     jump = stored(right - left)
-    value = area[:, None] * jump
-    held = jnp.stack([right, left])
-    sums, own = _with_values(total.sums, view, line.pixel, line.used, value, held)
+    value = area * jump
+    sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
     use = jnp.stack([line.used] * 3)
-    records = with_lines(total.records, use, own, places, jump, area, corners, motion)
+    records = with_lines(total.records, use, own, places, jump.T, area, corners, motion)
     return Blended(records, sums)
 
 
@@ -414,32 +416,39 @@ def _with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Bl
     """Add lines across which a light begins."""
     assert method.glow is not None
     assert view.cast is not None
-    area = _area(line.begin, line.end)
-    glow = assemble(stored(method.glow(view.scene, line.light, line.face, line.barycentrics)))
-    jump = stored(jnp.where(line.lit_on_right, 1, -1)[:, None] * glow)
-    own = view.image.reshape(-1, view.image.shape[2])[_place(view, line.pixel, 4)]
-    to_other = jnp.where(line.centre_is_lit, -1, 1)[:, None] * glow
-    value = area[:, None] * jump + jnp.where(line.wrong_side[:, None], to_other, 0)
-    held = jnp.stack([own, own + to_other])
+    area = stored(_area(line.begin, line.end))
+    glow = assemble_rows(method.glow(view.scene, line.light, line.face, line.barycentrics))
+    jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
+    own = stored(_colors(view, _place(view, line.pixel, 4)))
+    to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
+    value = area * jump + jnp.where(line.wrong_side, to_other, 0)
+    held = own, own + to_other
     sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held)
     places = [_place(view, line.pixel, look) for look in line.look]
     use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
-    records = with_lines(total.records, use, number, places, jump, area, line.vertices, line.motion)
+    vertices, motion = line.vertices, line.motion
+    records = with_lines(total.records, use, number, places, jump.T, area, vertices, motion)
     return Blended(records, sums)
 
 
 def _with_values(
-    total: Sums | None, view: View, pixel: Array, used: Array, value: Array, held: Array
-) -> tuple[Sums | None, Array]:
+    total: Sums | None,
+    view: View,
+    pixel: Int[Array, "2 n"],
+    used: Bool[Array, " n"],
+    value: Float[Array, "channels n"],
+    held: Sequence[Float[Array, "channels n"]],
+) -> tuple[Sums | None, Int[Array, " n"]]:
     """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
     number = stored(jnp.where(used, pixel[1] * (view.image.shape[1] - 2) + pixel[0], 0))
     if total is None:
         return None, number
-    added = total.added.at[number].add(jnp.where(used[:, None], value, 0))
+    added = total.added.at[number].add(stored(jnp.where(used, value, 0)).T)
+    least = stored(jnp.where(used, reduce(jnp.minimum, held), jnp.inf))
+    greatest = stored(jnp.where(used, reduce(jnp.maximum, held), -jnp.inf))
     low, high = total.range
-    low = low.at[number].min(jnp.where(used[:, None], jnp.min(held, axis=0), jnp.inf))
-    high = high.at[number].max(jnp.where(used[:, None], jnp.max(held, axis=0), -jnp.inf))
-    return total._replace(added=added, range=(low, high)), number
+    range_ = low.at[number].min(least.T), high.at[number].max(greatest.T)
+    return total._replace(added=added, range=range_), number
 
 
 def _along(
@@ -453,16 +462,16 @@ def _along(
     is its slope.
     """
     rim = seen.rim
-    first, depth = rim.first[:, None], rim.depth[:, None]
-    centre = jnp.clip(seen.centre_depth[:, None], first, depth)
-    bends = first < depth
+    first, depth = rim.first, rim.depth
+    centre = jnp.clip(seen.centre_depth, first, depth)
     far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
-    far = jnp.where(bends, far, bend)
+    far = jnp.where(first < depth, far, bend)
     # A shadow may begin where the slope is taken.
-    most = 2 * jnp.ptp(jnp.stack([front, bend, far, inner]), axis=0)
+    known = front, bend, far, inner
+    most = 2 * (reduce(jnp.maximum, known) - reduce(jnp.minimum, known))
     rise = jnp.clip(depth * (inner - beside) / BESIDE, -most, most)
     # Seen from ever flatter above, it changes with the square root of the depth.
-    mean = jnp.where(rim.single, 1 / 2, 2 / 3)[:, None]
+    mean = jnp.where(rim.single, 1 / 2, 2 / 3)
     passes = centre > first
     near = jnp.where(passes, near, bend)
     integral = (

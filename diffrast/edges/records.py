@@ -74,9 +74,7 @@ def after_batch(records: Records) -> Records:
     return records._replace(batch=batch, following=following)
 
 
-def with_rows(
-    records: Records | None, used: Array, rows: tuple[Array, ...]
-) -> Records | None:
+def with_rows(records: Records | None, used: Array, rows: tuple[Array, ...]) -> Records | None:
     """Write rows behind those in use, as far as there is room; None where nothing is recorded."""
     if records is None:
         return None

@@ -174,9 +174,9 @@ def look(
     # Seen from just inside, and from just beyond.
     offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
-    points = (x[:, :, None], y[:, :, None])  # (2 lines, 2 ends, 1, n)
-    around_corners = corners_of(around, faces, pixels)[:, :, None, None]
-    values, depth = edge_values(around_corners, *points, near=tuple(stored(centre)))
+    x, y = stored((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
+    around_corners = corners_of(around, faces, pixels)
+    values, depth = edge_values(around_corners[:, :, None, None], x, y, near=(centre[0], centre[1]))
     patch = stored(topology.patches[jnp.maximum(around, 0)])
     fine = jnp.min(area(face_corners), axis=0) < _FINE
     front_patch = stored(topology.patches[jnp.maximum(front, 0)])
@@ -227,7 +227,7 @@ def look(
     front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored((front_look, beyond_look))
-    tiny = stored(area(corners_of(pictured, faces, pixels))) < _FINE
+    tiny = stored(area(around_corners[:, :, :9])) < _FINE
     before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     above = tiny & before
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
