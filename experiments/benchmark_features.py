@@ -119,7 +119,10 @@ def run(
     progress: bool = False,
 ) -> dict[str, Any]:
     """Time the variants; returns what is written: by variant, milliseconds and differences."""
-    chosen = {name: v for name, v in variants().items() if only is None or name in only}
+    known = variants()
+    wanted = set(known if only is None else only)
+    wanted |= {known[name].base for name in wanted}
+    chosen = {name: variant for name, variant in known.items() if name in wanted}
     jobs = {}
     for name, variant in chosen.items():
         draw, arguments = weighted_picture(variant, size)
@@ -181,7 +184,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
 def main() -> None:
     parser = benchmark_options(__doc__, "benchmark_features", repeats=30)
     parser.add_argument("--size", type=int, default=512, help="rows and columns of the picture")
-    parser.add_argument("--only", nargs="+", metavar="FEATURE", help="and what it is compared with")
+    parser.add_argument("--only", nargs="+", choices=variants(), metavar="FEATURE")
     options = vars(parser.parse_args())
     print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
 

@@ -4,7 +4,7 @@ On a CPU a loop over faces that each touch a few dozen neighbouring pixels beats
 sorts faces into tiles: a block of pixels stays in the first cache level, nothing is binned, and no
 work list has a capacity. The loops are `lax` loops, compiled, over vectorised blocks:
 
-* faces of up to 24×32 pixels: one block each, of the smallest size in `BLOCKS` that holds it;
+* faces of up to 40×48 pixels: one block each, of the smallest size in `BLOCKS` that holds it;
 * all others: rows of tiles, each row only as wide as the edges leave it, without the tiles that are
   known to be hidden by what is drawn already. Vertices may lie behind the eye, and the near and the
   far plane are tested at every pixel.
@@ -22,6 +22,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._selection import batches_of
+from diffrast._stored import stored
 from diffrast.raster.edge_functions import (
     Edge,
     Image,
@@ -135,10 +136,10 @@ def _resolve(
     buffer: Array, corner: tuple[Array, Array], inside: Array, key: Array, face: Array
 ) -> Array:
     """Keep, at each pixel of a block, the larger key; the first drawn of equal ones."""
-    old = lax.dynamic_slice(buffer, corner, inside.shape)
+    old = _block(buffer, corner, inside.shape)
     tag = jnp.broadcast_to(_id_as_float(face, key.dtype), key.shape)
     new = jnp.where(inside & (key > old.real), lax.complex(key, tag), old)
-    return lax.dynamic_update_slice(buffer, new, corner)
+    return _put(buffer, new, corner)
 
 
 def _pixel_grid(block: tuple[int, int]) -> tuple[Array, Array]:
@@ -167,10 +168,12 @@ def _draw_blocks(
     keys = vertices.rank * inverse_w
 
     def draw(i: Array, buffer: Array) -> Array:
-        face = order[i]
-        corners = [faces[face, j] for j in range(3)]
-        x_fixed = [vertices.x_fixed[c] for c in corners]
-        y_fixed = [vertices.y_fixed[c] for c in corners]
+        face = _entry(order, i)
+        corners = list(_block(faces, (face, jnp.zeros_like(face)), (1, 3))[0])
+        x_fixed, y_fixed, x, y, values = (
+            [_entry(column, c) for c in corners]
+            for column in (vertices.x_fixed, vertices.y_fixed, x_pixel, y_pixel, keys)
+        )
         column, _ = pixel_range(minimum3(x_fixed), x_fixed[0], size=image.width, bits=bits)
         row, _ = pixel_range(minimum3(y_fixed), y_fixed[0], size=image.height, bits=bits)
         x_origin = (column << bits) + first_centre(image.width, bits)
@@ -189,9 +192,6 @@ def _draw_blocks(
             value = (value - bias(a, b)) >> bits
             outside = outside | (value + a * columns + b * rows)  # the sign bit of any edge
 
-        x = [x_pixel[c] for c in corners]
-        y = [y_pixel[c] for c in corners]
-        values = [keys[c] for c in corners]
         dx, dy = triangle_slopes(x, y, values)
         x_offset = column.astype(x[0].dtype) + (1 - image.width) / 2 - x[0]
         y_offset = row.astype(x[0].dtype) + (1 - image.height) / 2 - y[0]
@@ -224,49 +224,50 @@ def _draw_sweeps(
     first, stop = span
 
     def draw_chunk(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        start = first + n * CHUNK
-        slots = start + jnp.arange(CHUNK)
+        slots = first + n * CHUNK + jnp.arange(CHUNK)
         chunk = order[jnp.minimum(slots, order.shape[0] - 1)]
-        sweeps = set_up(corners_of(vertices, faces, chunk), image, cull_backfaces)
+        sweeps = stored(set_up(corners_of(vertices, faces, chunk), image, cull_backfaces))
         walk = _plan_walk(sweeps, slots < stop, image)
 
-        def hidden(tile: Array, lowest_keys: Array) -> Array:
-            i, tile_row, tile_column = _tile_place(tile, image)
-            key = Plane(*(member[0, i] for member in sweeps.planes))
-            corner = evaluate(key, tile_column * TILE[1], tile_row * TILE[0], 0, 0)
+        def hidden(tile: _Tile, lowest_keys: Array) -> Array:
+            key = Plane(*(member[0, tile.face] for member in sweeps.planes))
+            corner = evaluate(key, tile.column, tile.row, 0, 0)
             nearest = corner + sum(
                 jnp.maximum(slope * (size - 1), 0)
                 for slope, size in ((key.dx, TILE[1]), (key.dy, TILE[0]))
             )
-            nearest = jnp.clip(nearest, *(bound[i] for bound in sweeps.key_range))
+            nearest = jnp.clip(nearest, *(bound[tile.face] for bound in sweeps.key_range))
             nearest = nearest + jnp.abs(nearest) * (_ROUNDINGS * jnp.finfo(nearest.dtype).eps)
-            return nearest <= lowest_keys[tile_row, tile_column]
+            return nearest <= lowest_keys[tile.place]
 
-        def draw(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        def draw(state: tuple[_Tile, Array, Array]) -> tuple[_Tile, Array, Array]:
             tile, buffer, lowest_keys = state
-            i, tile_row, tile_column = _tile_place(tile, image)
-            row, column = tile_row * TILE[0], tile_column * TILE[1]
-            sweep = jax.tree.map(lambda member: member[..., i], sweeps)
+            sweep, face = jax.tree.map(lambda x: _entry(x, tile.face), (sweeps, chunk))
             outside = jnp.zeros((), jnp.int32)
             for edge in each_edge(sweep.edges):
-                value = edge_value(edge, column, row)
+                value = edge_value(edge, tile.column, tile.row)
                 outside = outside | (value + edge.a * columns + edge.b * rows)
             key, *limits = (
-                evaluate(Plane(*plane), column, row, columns, rows)
+                evaluate(Plane(*plane), tile.column, tile.row, columns, rows)
                 for plane in zip(*sweep.planes, strict=True)
             )
             key = jnp.clip(key, *sweep.key_range)
             for limit in limits:
                 outside = outside | jnp.where(limit >= 0, 0, -1)
-            buffer = _resolve(buffer, (row, column), outside >= 0, key, chunk[i])
-            lowest = _smallest(lax.dynamic_slice(buffer, (row, column), TILE).real)
-            lowest_keys = lowest_keys.at[tile_row, tile_column].set(lowest)
-            tile = lax.while_loop(
-                lambda tile: (tile < _END) & hidden(tile, lowest_keys), walk.after, walk.after(tile)
-            )
+            corner = tile.row, tile.column
+            buffer = _resolve(buffer, corner, outside >= 0, key, face)
+            lowest = _smallest(_block(buffer, corner, TILE).real)
+            lowest_keys = _put(lowest_keys, lowest[None, None], tile.place)
+
+            def advance(state: tuple[_Tile, Array]) -> tuple[_Tile, Array]:
+                tile = _tile_at(walk.after(state[0].number), image)
+                return tile, (tile.number < _END) & hidden(tile, lowest_keys)
+
+            tile = lax.while_loop(lambda state: state[1], advance, (tile, tile.number < _END))[0]
             return tile, buffer, lowest_keys
 
-        return lax.while_loop(lambda s: s[0] < _END, draw, (walk.first, *state))[1:]
+        start = _tile_at(walk.first, image), *state
+        return lax.while_loop(lambda state: state[0].number < _END, draw, start)[1:]
 
     chunks = batches_of(stop - first, CHUNK)
     return lax.fori_loop(0, chunks, draw_chunk, (buffer, lowest_keys))[0]
@@ -289,10 +290,36 @@ def _tile_counts(image: Image) -> tuple[int, int]:
     return count(image.height, TILE[0]), count(image.width, TILE[1])
 
 
-def _tile_place(tile: Array, image: Image) -> tuple[Array, Array, Array]:
-    """Face in the chunk, row and column of tiles."""
+class _Tile(NamedTuple):
+    """A tile of a face: what is carried along is not computed again for each use, one by one."""
+
+    number: Array  # see `_Walk`
+    face: Array  # in the chunk
+    place: tuple[Array, Array]  # row and column of tiles
+    row: Array  # of its first pixel
+    column: Array
+
+
+def _tile_at(number: Array, image: Image) -> _Tile:
     rows, columns = _tile_counts(image)
-    return tile // (rows * columns), tile // columns % rows, tile % columns
+    row, column = number // columns % rows, number % columns
+    face = number // (rows * columns)
+    return _Tile(number, face, (row, column), row * TILE[0], column * TILE[1])
+
+
+# Indices that are known not to be negative: one operation less each ------------------------------
+
+
+def _block(table: Array, corner: tuple[Array, Array], shape: tuple[int, ...]) -> Array:
+    return lax.dynamic_slice(table, corner, shape, allow_negative_indices=False)
+
+
+def _put(table: Array, block: Array, corner: tuple[Array, Array]) -> Array:
+    return lax.dynamic_update_slice(table, block, corner, allow_negative_indices=False)
+
+
+def _entry(column: Array, i: Array) -> Array:
+    return lax.dynamic_index_in_dim(column, i, -1, keepdims=False, allow_negative_indices=False)
 
 
 class _Walk(NamedTuple):

@@ -19,8 +19,9 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 GUARD_BITS = 22  # |fixed-point coordinate| <= 2**22, so that differences fit 24 bits
-# Pixel blocks (rows, columns) that hold a face of each block class whole.
-BLOCKS = ((4, 4), (16, 16), (24, 32))
+# Pixel blocks (rows, columns) that hold a face of each block class whole. They are of fewer than
+# 2^11 pixels: twice the area of a face, in grid steps, fits int32.
+BLOCKS = ((4, 4), (16, 16), (24, 32), (40, 48))
 
 # Classes of faces, in drawing order: one a block size, then LARGE, CULLED.
 LARGE, CULLED = range(len(BLOCKS), len(BLOCKS) + 2)
