@@ -14,8 +14,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from diffrast._stored import assemble
-
 
 @jax.jit
 def affine(
@@ -33,20 +31,16 @@ def affine_parts(
     points: Float[Array, "*batch 3"],
 ) -> tuple[Float[Array, "*batch rows"], Float[Array, "*batch rows"]]:
     """The value of `affine` as an unevaluated sum: the rounded value and what rounding took."""
+    matrix_high, matrix_low = _halves(matrix[:, :3])
     points_high, points_low = _halves(points)
-    sums = []
-    for row, rest in zip(matrix, remainder, strict=True):  # by rows: vector code for many points
-        row_high, row_low = _halves(row[:3])
-        total = jnp.broadcast_to(row[3], points.shape[:-1])
-        lost = jnp.broadcast_to(rest, total.shape)
-        for axis in range(3):
-            high, low = points_high[..., axis], points_low[..., axis]
-            total, error = _two_sum(total, high * row_high[axis])
-            small = high * row_low[axis] + low * row[axis]
-            lost = lost + (error + small)
-        sums.append(_two_sum(total, lost))
-    value, lost = (assemble(list(parts)) for parts in zip(*sums, strict=True))
-    return value, lost
+    total = jnp.broadcast_to(matrix[:, 3], (*points.shape[:-1], matrix.shape[0]))
+    lost = jnp.broadcast_to(remainder, total.shape)
+    for axis in range(3):
+        high, low = points_high[..., axis, None], points_low[..., axis, None]
+        total, error = _two_sum(total, high * matrix_high[:, axis])
+        small = high * matrix_low[:, axis] + low * (matrix_high + matrix_low)[:, axis]
+        lost = lost + (error + small)
+    return _two_sum(total, lost)
 
 
 @jax.custom_jvp
