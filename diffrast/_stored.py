@@ -83,17 +83,10 @@ def stored_rows(values: Array) -> Array:
     return assemble(stored([values[:, i] for i in range(values.shape[1])]))
 
 
-def assemble(channels: list[Array]) -> Array:
-    """Stack channels along a new last axis, each computed once."""
-    image = jnp.zeros((*channels[0].shape, len(channels)), channels[0].dtype)
+def assemble(channels: list[Array], *, first: bool = False) -> Array:
+    """Stack channels along a new last axis, or a new first one, each computed once."""
+    shape, count = channels[0].shape, len(channels)
+    image = jnp.zeros((count, *shape) if first else (*shape, count), channels[0].dtype)
     for c, channel in enumerate(channels):
-        image = image.at[..., c].set(channel)
+        image = image.at[c if first else (..., c)].set(channel)
     return image
-
-
-def assemble_rows(rows: list[Array]) -> Array:
-    """Stack rows along a new first axis, each computed once."""
-    table = jnp.zeros((len(rows), *rows[0].shape), rows[0].dtype)
-    for r, row in enumerate(rows):
-        table = table.at[r].set(row)
-    return table

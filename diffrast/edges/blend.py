@@ -20,7 +20,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import batches_of, over_batches, prefix_sum
-from diffrast._stored import assemble_rows, stored
+from diffrast._stored import assemble, stored
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import blocks_with_background
 from diffrast.edges.pieces import (
@@ -317,9 +317,9 @@ def _place(view: View, pixel: Array, look: Array | int) -> Array:
     return (pixel[1] + look // 3) * view.image.shape[1] + pixel[0] + look % 3
 
 
-def _colors(view: View, place: Int[Array, " n"]) -> Float[Array, "channels n"]:
-    """What the image shows there."""
-    return view.image.reshape(-1, view.image.shape[2])[place].T
+def _colors(image: Array, place: Int[Array, " n"]) -> Float[Array, "channels n"]:
+    """What an image shows there."""
+    return image.reshape(-1, image.shape[2])[place].T
 
 
 def _shade(
@@ -333,7 +333,7 @@ def _shade(
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = assemble_rows(method.shader(view.scene, face, barycentrics))
+    colors = assemble(method.shader(view.scene, face, barycentrics), first=True)
     return jnp.split(colors, len(points), axis=1)
 
 
@@ -349,11 +349,9 @@ def _with_pieces(
     rim = found.rim
     looks = (found.front.look, found.beyond.look, rim.inner)
     places = [_place(view, pieces.pixel, look) for look in looks]
-    near, behind, inner = stored([_colors(view, place) for place in places])
-    bare = view.background[:, None]
-    if bare.ndim > 2:
-        own_place = _place(view, pieces.pixel, 4)
-        bare = view.background.reshape(-1, view.image.shape[2])[own_place].T
+    near, behind, inner = stored([_colors(view.image, place) for place in places])
+    centre, bare = _place(view, pieces.pixel, 4), view.background
+    bare = bare[:, None] if bare.ndim == 1 else _colors(bare, centre)
     behind = jnp.where(found.beyond.face == BACKGROUND, bare, behind)
     front = near
     outward = jnp.where(found.front_on_right, -1, 1)
@@ -373,7 +371,7 @@ def _with_pieces(
         jump = behind - jnp.where(smooth, moved, front)
         mean = integral - rim.depth * near
         value = jnp.where(smooth, area * (behind - near) + length * mean, area * jump)
-        own = _colors(view, _place(view, pieces.pixel, 4))
+        own = _colors(view.image, centre)
         value = jnp.where(found.wrong_side, value + front - own, value)
     jump, value, front, behind = stored((jump, value, front, behind))
     size = reduce(jnp.maximum, jnp.abs(behind) + jnp.abs(front))
@@ -398,7 +396,7 @@ def _with_line(total: Blended, view: View, method: Method, line: Line) -> Blende
     area = stored(_area(line.begin, line.end))
     places = [_place(view, line.pixel, look) for look in line.look]
     if method.shader is None:
-        right, left = stored([_colors(view, place) for place in places])
+        right, left = stored([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
         right, left = _shade(view, method, *points)
@@ -417,9 +415,10 @@ def _with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Bl
     assert method.glow is not None
     assert view.cast is not None
     area = stored(_area(line.begin, line.end))
-    glow = assemble_rows(method.glow(view.scene, line.light, line.face, line.barycentrics))
+    colors = method.glow(view.scene, line.light, line.face, line.barycentrics)
+    glow = assemble(colors, first=True)
     jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
-    own = stored(_colors(view, _place(view, line.pixel, 4)))
+    own = stored(_colors(view.image, _place(view, line.pixel, 4)))
     to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
     value = area * jump + jnp.where(line.wrong_side, to_other, 0)
     held = own, own + to_other

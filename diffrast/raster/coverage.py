@@ -107,6 +107,21 @@ def _draw(
     return draw(positions_clip, faces)
 
 
+# Indices that are known not to be negative: one operation less each ------------------------------
+
+
+def _block(table: Array, corner: tuple[Array, Array], shape: tuple[int, ...]) -> Array:
+    return lax.dynamic_slice(table, corner, shape, allow_negative_indices=False)
+
+
+def _put(table: Array, block: Array, corner: tuple[Array, Array]) -> Array:
+    return lax.dynamic_update_slice(table, block, corner, allow_negative_indices=False)
+
+
+def _entry(column: Array, i: Array) -> Array:
+    return lax.dynamic_index_in_dim(column, i, -1, keepdims=False, allow_negative_indices=False)
+
+
 # The depth buffer ---------------------------------------------------------------------------------
 
 
@@ -291,7 +306,7 @@ def _tile_counts(image: Image) -> tuple[int, int]:
 
 
 class _Tile(NamedTuple):
-    """A tile of a face: what is carried along is not computed again for each use, one by one."""
+    """A tile of a face, found where the walk goes on: in the loop each part is one operation."""
 
     number: Array  # see `_Walk`
     face: Array  # in the chunk
@@ -305,21 +320,6 @@ def _tile_at(number: Array, image: Image) -> _Tile:
     row, column = number // columns % rows, number % columns
     face = number // (rows * columns)
     return _Tile(number, face, (row, column), row * TILE[0], column * TILE[1])
-
-
-# Indices that are known not to be negative: one operation less each ------------------------------
-
-
-def _block(table: Array, corner: tuple[Array, Array], shape: tuple[int, ...]) -> Array:
-    return lax.dynamic_slice(table, corner, shape, allow_negative_indices=False)
-
-
-def _put(table: Array, block: Array, corner: tuple[Array, Array]) -> Array:
-    return lax.dynamic_update_slice(table, block, corner, allow_negative_indices=False)
-
-
-def _entry(column: Array, i: Array) -> Array:
-    return lax.dynamic_index_in_dim(column, i, -1, keepdims=False, allow_negative_indices=False)
 
 
 class _Walk(NamedTuple):
