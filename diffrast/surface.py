@@ -83,6 +83,7 @@ def cast_outlines(
         edge=outlines(scene.lights, shadows, geometry, topology, points, lit),
         lit=lit,
         patches=topology.patches,
+        turned=jnp.stack(shadows.turned),
         source=source,
         weight=jnp.array(weight, source.dtype),
         parallel=jnp.zeros((), bool),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import box_filter
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -210,6 +211,36 @@ def test_a_light_that_is_not_seen_leaves_its_ambient_part():
         alone = [plain[number] if i == number else light for i, light in enumerate(base)]
         want = want + np.asarray(lit)[..., k, None] * (picture(alone) - ambient)
     np.testing.assert_allclose(got, want, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("cubes in the light of a spot", 1.2e-4), ("hills in the evening", 1.5e-3)]
+)
+def test_pictures_with_outlines_equal_the_mean_over_pixels(name, error):
+    """Also where cubes touch the floor, to the last digits, and on faces turned from the light.
+
+    Without edges the errors are 2.7e-3 and 4.5e-3; of the hills most is what the colour of rough
+    ground changes within a pixel.
+    """
+    scene, camera = make(name)
+    picture = dr.render(scene, camera, settings(antialias=True))
+    oracle = scenes.Oracle(scene, camera.view, camera.projection)
+    want = box_filter.render_box(
+        oracle.positions,
+        oracle.normals,
+        oracle.faces,
+        oracle.view,
+        oracle.projection,
+        lights=[light | {"shadow": True} for light in oracle.lights],
+        material=oracle.material(),
+        background=np.zeros(3),
+        height=SIZE,
+        width=SIZE,
+        shading="phong",
+        lines=16,
+        piercing=name.startswith("cubes"),
+    )
+    assert np.mean(np.abs(picture - want)) < error
 
 
 def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():

@@ -32,6 +32,7 @@ PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
+_ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
 # Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
@@ -50,6 +51,7 @@ class Cast(NamedTuple):
     # pixel and the one on its right, or below it; -1 if there is none.
     lit: Bool[Array, "lights height_with_border width_with_border"]
     patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
+    turned: Bool[Array, "lights F"]  # faces that turn their outside to the light
     source: Float[Array, "lights 4"]  # clip position
     weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
     parallel: Bool[Array, ""]  # whether the weight moves with the light
@@ -149,7 +151,8 @@ def cross_shadows(
     next_to = stored(face_image[row, column])
     patch = cast.patches[jnp.maximum(next_to, 0)] == cast.patches[jnp.maximum(own, 0)]
     again = jnp.any(edge[:, None] == jnp.where(jnp.tri(12, k=-1)[..., None] > 0, edge, -2), axis=1)
-    valid = exists & (edge >= 0) & (own >= 0) & patch & ~again
+    shone_on = (own >= 0) & cast.turned[light, jnp.maximum(own, 0)]
+    valid = exists & (edge >= 0) & shone_on & patch & ~again
 
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
     vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in (1, 2)]))
@@ -245,6 +248,10 @@ def shadow_of(
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
     centre_on_right = _dot(foot, normal) < 0
+    # Where the centre's side is not what the image has, rounding has moved it over the line; or
+    # what the line bounds is dark or lit for another reason.
+    wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
+    near = jnp.abs(_dot(foot, normal)) < _ROUNDED
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
@@ -281,13 +288,13 @@ def shadow_of(
     return Shadow(
         pixel=pixel,
         light=light,
-        used=exists,
+        used=exists & (near | ~wrong_side),
         face=face,
         barycentrics=barycentrics(e),
         look=look,
         lit_on_right=lit_on_right,
         centre_is_lit=centre_is_lit,
-        wrong_side=alone & ((lit_on_right == centre_on_right) != centre_is_lit),
+        wrong_side=wrong_side,
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
         vertices=jnp.stack(vertices).reshape(4, 2, -1),

@@ -18,6 +18,7 @@ from diffrast.light import dot_columns
 from diffrast.shadows.maps import Pictures
 
 ROUNDINGS = 32  # units in the last place
+_LAST_DIGITS = 8  # such units, of world positions
 
 
 class Rays(NamedTuple):
@@ -116,8 +117,9 @@ def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:
     sides = [dot_columns(line.ray, cross_rows(*edge)) for edge in ((b, c), (c, a), (a, b))]
     distance = dot_columns(normal, a)
     extent = jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.abs(c))
-    rounding = dot_columns(jnp.abs(normal), extent)
-    rounding = rounding * (ROUNDINGS * jnp.finfo(corners.dtype).eps)
+    # Of what is computed here, and of positions: surfaces that touch do so but for the last digits.
+    size = ROUNDINGS * extent + _LAST_DIGITS * jnp.abs(line.corner + line.point)
+    rounding = dot_columns(jnp.abs(normal), size) * jnp.finfo(corners.dtype).eps
     along, sides, distance, rounding = stored((along, sides, distance, rounding))
     sign = jnp.where(along < 0, -1, 1)
     values = [sign * side for side in sides]
