@@ -303,19 +303,13 @@ def _no_seams(edges: Edges, normals: Array, faces: Array) -> Array:
 
 def _bent_seams(edges: Edges, normals: Array, faces: Array) -> Array:
     """Those seams on whose sides the normals at the same place differ."""
-    differs = _no_seams(edges, normals, faces)
-    for k in range(2):
-        corner = edges.corners // 3 if k == 0 else edges.corners % 3
-        one, other = (
-            [normals[:, c][vertex] for c in range(3)]
-            for vertex in (faces[jnp.maximum(edges.faces[:, i], 0), corner[:, i]] for i in range(2))
-        )
-        size = _largest(one) + _largest(other)
-        apart = _largest([a - b for a, b in zip(one, other, strict=True)])
-        differs = differs | (apart > _SAME_NORMAL * size)
-    return edges.seam & differs
+    corner = jnp.stack([edges.corners // 3, edges.corners % 3])  # (2 ends, E, 2 faces)
+    vertex = faces[jnp.maximum(edges.faces, 0), corner]
+    one, other = jnp.moveaxis(normals.T[:, vertex], -1, 0)  # (3, 2 ends, E) each
+    apart = _largest(one - other) > _SAME_NORMAL * (_largest(one) + _largest(other))
+    return edges.seam & jnp.any(apart, axis=0)
 
 
-def _largest(columns: Columns) -> Array:
-    """The largest size of the components."""
-    return reduce(jnp.maximum, map(jnp.abs, columns))
+def _largest(vectors: Array) -> Array:
+    """The largest size of the three components, which are rows."""
+    return reduce(jnp.maximum, jnp.abs(vectors))
