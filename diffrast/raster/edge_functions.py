@@ -14,6 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from diffrast._compensated import difference_of_products
+from diffrast._stored import stored
 from diffrast.raster.fixed_point import (
     FAR,
     GUARD_BITS,
@@ -40,19 +41,28 @@ class Image(NamedTuple):
     bits: int
 
 
-def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Vertices:
-    """Corners of faces; the first axis of every column is the corner of a face."""
+class Corners(NamedTuple):
+    """Corners of faces, (3, n) columns, the smallest first in the same cyclic order.
+
+    Differences from the first are taken: from a large one they would lose all digits of corners
+    next to the eye.
+    """
+
+    own: Vertices
+    start: Vertices  # of the edge opposite to each
+    end: Vertices
+
+
+def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Corners:
+    """The corners of some faces."""
     corners = faces[chunk].T
-    return Vertices(*(column[corners] for column in vertices))
-
-
-def _edge_ends(corners: Vertices) -> tuple[Vertices, Vertices]:
-    """Start and end of the edge opposite to each corner."""
-
-    def rolled(shift: int) -> Vertices:
-        return Vertices(*(jnp.roll(column, -shift, axis=0) for column in corners))
-
-    return rolled(1), rolled(2)
+    sizes = _largest([column[corners] for column in (vertices.x, vertices.y, vertices.w)])
+    smallest = jnp.argmin(sizes, axis=0)
+    # Own corner, start and end: each the next of the one before.
+    turned = (jnp.arange(3)[:, None, None] + jnp.arange(3)[:, None] + smallest) % 3
+    index = stored(corners[turned, jnp.arange(chunk.size)])
+    columns = [column[index] for column in vertices]
+    return Corners(*(Vertices(*(column[k] for column in columns)) for k in range(3)))
 
 
 class Edge(NamedTuple):
@@ -108,7 +118,7 @@ def _anchored_edge(x: Array, y: Array, a: Array, b: Array, sign: Array, image: I
     return Edge(a, b, k, x / steps, y / steps, run)
 
 
-def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
+def set_up(faces: Corners, image: Image, cull_backfaces: bool) -> Sweep:
     """Faces with any vertices: edges as lines of homogeneous coordinates, near and far per pixel.
 
     e_i(p) = p · (v_j × v_k) is proportional to the barycentric coordinate i times 1/w, and an
@@ -116,8 +126,8 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
     "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
     the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
     """
-    sizes = _largest([corners.x, corners.y, corners.w])
-    corners, scale = _smallest_first(corners, sizes), maximum3(list(sizes))
+    corners = faces.own
+    scale = maximum3(list(_largest([corners.x, corners.y, corners.w])))
     inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
     points = [column * inverse_scale for column in (corners.x, corners.y, corners.w)]
     # (v_1 - v_0) × (v_2 - v_0), v_2 × v_0 and v_0 × v_1, for each the three components.
@@ -162,7 +172,7 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
         return jnp.where(regular, first, 0), jnp.where(drawn, last, -1)
 
     return Sweep(
-        _homogeneous_edge(*_edge_ends(corners), sign, image),
+        _homogeneous_edge(faces.start, faces.end, sign, image),
         Plane(value, dx, dy, centre_x, centre_y),
         (
             jnp.where(bounded, minimum3(ratios), -infinite),
@@ -171,21 +181,6 @@ def set_up(corners: Vertices, image: Image, cull_backfaces: bool) -> Sweep:
         extent(x_fixed, image.width),
         extent(y_fixed, image.height),
     )
-
-
-def _smallest_first(corners: Vertices, sizes: Array) -> Vertices:
-    """The corners in the same cyclic order, the one of the smallest size first.
-
-    Differences from the first corner are taken: from a large one they would lose all digits of
-    corners next to the eye.
-    """
-    first = jnp.argmin(sizes, axis=0)
-
-    def rolled(column: Array) -> Array:
-        second, third = (jnp.roll(column, -shift, axis=0) for shift in (1, 2))
-        return jnp.where(first == 0, column, jnp.where(first == 1, second, third))
-
-    return Vertices(*(rolled(column) for column in corners))
 
 
 def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image) -> Edge:
