@@ -1,7 +1,7 @@
 """A scene as one mesh in the world, and the points of it that are seen."""
 
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ from diffrast._stored import stored, stored_rows
 from diffrast._topology import Edges, Topology, traced_topology
 from diffrast._varying import varying_zero
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
+from diffrast.edges.planes import largest
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
 from diffrast.linalg import (
@@ -306,10 +307,5 @@ def _bent_seams(edges: Edges, normals: Array, faces: Array) -> Array:
     corner = jnp.stack([edges.corners // 3, edges.corners % 3])  # (2 ends, E, 2 faces)
     vertex = faces[jnp.maximum(edges.faces, 0), corner]
     one, other = jnp.moveaxis(normals.T[:, vertex], -1, 0)  # (3, 2 ends, E) each
-    apart = _largest(one - other) > _SAME_NORMAL * (_largest(one) + _largest(other))
+    apart = largest(one - other) > _SAME_NORMAL * (largest(one) + largest(other))
     return edges.seam & jnp.any(apart, axis=0)
-
-
-def _largest(vectors: Array) -> Array:
-    """The largest size of the three components, which are rows."""
-    return reduce(jnp.maximum, jnp.abs(vectors))

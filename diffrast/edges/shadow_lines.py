@@ -247,11 +247,12 @@ def shadow_of(
     low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
-    centre_on_right = _dot(foot, normal) < 0
+    from_centre = _dot(foot, normal)
+    centre_on_right = from_centre < 0
     # Where the centre's side is not what the image has, rounding has moved it over the line; or
     # what the line bounds is dark or lit for another reason.
     wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
-    near = jnp.abs(_dot(foot, normal)) < _ROUNDED
+    near = jnp.abs(from_centre) < _ROUNDED
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])

@@ -51,6 +51,7 @@ class Corners(NamedTuple):
     own: Vertices
     start: Vertices  # of the edge opposite to each
     end: Vertices
+    scale: Array  # (n,), the size of the largest
 
 
 def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Corners:
@@ -62,7 +63,8 @@ def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Corners:
     turned = (jnp.arange(3)[:, None, None] + jnp.arange(3)[:, None] + smallest) % 3
     index = stored(corners[turned, jnp.arange(chunk.size)])
     columns = [column[index] for column in vertices]
-    return Corners(*(Vertices(*(column[k] for column in columns)) for k in range(3)))
+    own, start, end = (Vertices(*(column[k] for column in columns)) for k in range(3))
+    return Corners(own, start, end, maximum3(list(sizes)))
 
 
 class Edge(NamedTuple):
@@ -126,8 +128,7 @@ def set_up(faces: Corners, image: Image, cull_backfaces: bool) -> Sweep:
     "Triangle scan conversion using 2D homogeneous coordinates", 1997). So every edge and plane is
     the dot product of p = (x, y, 1) with a vector, whatever the signs of w.
     """
-    corners = faces.own
-    scale = maximum3(list(_largest([corners.x, corners.y, corners.w])))
+    corners, scale = faces.own, faces.scale
     inverse_scale = 1 / jnp.where(scale > 0, scale, 1)
     points = [column * inverse_scale for column in (corners.x, corners.y, corners.w)]
     # (v_1 - v_0) × (v_2 - v_0), v_2 × v_0 and v_0 × v_1, for each the three components.
