@@ -23,6 +23,7 @@ from diffrast.edges.pieces import (
     first_ones,
     to_pixels,
 )
+from diffrast.edges.rim import _border
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -389,3 +390,18 @@ def test_bad_arguments_of_the_stage_are_named(change, message):
     }
     with pytest.raises(ValueError, match=message):
         dr.antialias(**(arguments | change))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, 2.0, 4.4])
+@pytest.mark.parametrize("depth", [-0.3, 0.0, 0.2, 0.45])
+def test_depths_at_which_a_rim_takes_the_colour_that_it_carries_along(angle, depth):
+    """Of a colour that grows with the depth the pixel then loses its inner area."""
+    inward = np.array([np.cos(angle), np.sin(angle)])
+    border, weight = _border(jnp.array([depth]), jnp.asarray(inward)[:, None])
+    x, y = np.meshgrid(*[(np.arange(2000) + 0.5) / 2000 - 0.5] * 2)
+    inner = x * inward[0] + y * inward[1] + depth > 0
+    steps = np.linspace(-1, 1, 20001)
+    on_rim = -depth * inward[:, None] + steps * np.array([[-inward[1]], [inward[0]]])
+    chord = 2 * np.mean(np.max(np.abs(on_rim), axis=0) <= 0.5)
+    found = weight * border[0] + (1 - weight) * border[1]
+    np.testing.assert_allclose(found * chord, inner.mean(), atol=2e-3)

@@ -137,8 +137,8 @@ def derivatives(at, params, settings, fields, target):
 BOUNDS = {
     "cubes": (0.003, 0.006, 1e-5),
     "border": (0.01, 0.01, 2e-5),
-    "sphere": (0.02, 0.02, 1.5e-4),
-    "torus2": (0.03, 0.02, 5e-4),
+    "sphere": (0.01, 0.008, 1.5e-4),
+    "torus2": (0.021, 0.017, 5e-4),
     "lattice": (0.015, 0.015, 1e-4),
     "piercing": (0.003, 0.02, 1e-5),
     "shadow_sun": (0.01, 0.01, 2e-5),

@@ -66,6 +66,7 @@ from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import BACKGROUND, Seen, look, uncovered
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
+_SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
 
 Shader = Callable[[Any, Array, list[Array]], list[Array]]
 Glow = Callable[[Any, Array, Array, list[Array]], list[Array]]
@@ -456,20 +457,25 @@ def _along(
     """The colour of a smooth surface from its rim to where the pixel ends.
 
     Its integral over this depth; and the colour that counts as the rim moves. As a point at a
-    fixed depth keeps its colour, that is the one at the far end, less what the derivative of the
-    next pixel, which stands for this one's, says of it: as far as its colour is carried along, that
-    is its slope.
+    fixed depth keeps its colour, that is the one at the pixel's border, less what the derivative of
+    the next pixel, which stands for this one's, says of it: as far as its colour is carried along,
+    that is its slope.
     """
     rim = seen.rim
     first, depth = rim.first, rim.depth
-    centre = jnp.clip(seen.centre_depth, first, depth)
-    far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
-    far = jnp.where(first < depth, far, bend)
     # A shadow may begin where the slope is taken.
-    known = front, bend, far, inner
-    most = 2 * (reduce(jnp.maximum, known) - reduce(jnp.minimum, known))
-    rise = jnp.clip(depth * (inner - beside) / BESIDE, -most, most)
+    steepest = 2 * reduce(jnp.maximum, [jnp.abs(color) for color in (front, bend, far, inner)])
+    slope = jnp.clip((inner - beside) / BESIDE, -steepest, steepest)
     # Seen from ever flatter above, it changes with the square root of the depth.
+    part = jnp.sqrt(depth / jnp.maximum(rim.inner_depth, _SHALLOW))
+    across = front + part * (
+        (2 - part) * (inner - front) - 2 * (1 - part) * rim.inner_depth * slope
+    )
+    far = jnp.clip(
+        jnp.where(rim.single, far, across), jnp.minimum(bend, inner), jnp.maximum(bend, inner)
+    )
+    far = jnp.where(first < depth, far, bend)
+    centre = jnp.clip(seen.centre_depth, first, depth)
     mean = jnp.where(rim.single, 1 / 2, 2 / 3)
     passes = centre > first
     near = jnp.where(passes, near, bend)
@@ -478,7 +484,13 @@ def _along(
         + (centre - first) * (bend + mean * (near - bend))
         + (depth - centre) * (near + jnp.where(passes, 1 / 2, mean) * (far - near))
     )
-    return integral, far - rise
+
+    def moved(at: Array) -> Array:
+        part = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))
+        return front + part * (far - front) - at * slope
+
+    leaving, entering = (moved(at) for at in rim.border)
+    return integral, leaving + (rim.weight - 1) * (leaving - entering)
 
 
 def cropped(colors: Array, shape: tuple[int, ...]) -> Array:

@@ -10,8 +10,9 @@ from diffrast._stored import stored
 from diffrast.edges.neighborhood import picked, pixel_at
 from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
 
-BESIDE = 0.05  # pixels
+BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
+_SHORT = 1e-3  # pixels: shorter pieces matter no more
 
 
 class Rim(NamedTuple):
@@ -25,6 +26,9 @@ class Rim(NamedTuple):
     far: tuple[Int[Array, " n"], Columns]  # and where the pixel ends
     single: Bool[Array, " n"]  # whether one face covers what lies between
     beside: tuple[Int[Array, " n"], Columns]  # point `BESIDE` outwards of the next pixel's centre
+    inner_depth: Float[Array, " n"]  # of that centre
+    border: Float[Array, "2 n"]  # depths of the pixel's border, see `_border`,
+    weight: Float[Array, " n"]  # and the first one's weight
 
 
 def look_inwards(
@@ -70,6 +74,8 @@ def look_inwards(
     x, y = centre + step - BESIDE * inward
     beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
+    own_depth = -jnp.sum(middle * inward, axis=0)
+    border, weight = _border(own_depth, inward)
     return Rim(
         smooth=(front >= 0) & same[0] & same[1],
         inner=inner,
@@ -79,4 +85,29 @@ def look_inwards(
         far=(beyond, [b[1] for b in at]),
         single=covered[1],
         beside=(next_face, beside),
+        inner_depth=own_depth + jnp.sum(step * inward, axis=0),
+        border=stored(border),
+        weight=stored(weight),
     )
+
+
+def _border(centre: Float[Array, " n"], inward: Float[Array, "2 n"]) -> tuple[Array, Array]:
+    """Where chords of the pixel, parallel to a rim, end inside of it: what leaves as it moves.
+
+    Of a length w(s) at the depth s, they grow and then shrink at a constant rate each. A rim that
+    moves by one takes away -∫ w' c ds of a colour c(s) that moves along; as c(s) hardly curves over
+    those depths, that is w(0) times weight c(border[0]) + (1 - weight) c(border[1]).
+
+    Args:
+        centre: depth of the pixel's centre.
+        inward: unit normal of the rim.
+    """
+    steep, flat = jnp.max(abs(inward), axis=0), jnp.min(abs(inward), axis=0)
+    ends = jnp.stack([(steep - flat) / 2, (steep + flat) / 2])
+    inside = jnp.maximum(centre + jnp.stack([ends, -ends[::-1]]), 0)  # (shrink and grow, ends, n)
+    whole = flat > _SMALL
+    share = (inside[:, 1] - inside[:, 0]) / jnp.where(whole, flat, 1)
+    share = jnp.where(whole, share, jnp.where(inside[:, 1] > 0, 1, 0))
+    shrinks, grows = share
+    weight = shrinks / jnp.maximum(shrinks - grows, _SHORT)
+    return (inside[:, 0] + inside[:, 1]) / 2, weight
