@@ -7,10 +7,11 @@ does not have (`None`) adds no operation: a light without `ambient` adds no ambi
 
 import copy
 import math
-from typing import TypeAlias, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
+import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
 
 from diffrast._check import ArrayInput, float_array, one_of, positive_int, real_number
@@ -352,20 +353,36 @@ def _fade(light: SpotLight, to_light: Columns) -> Array:
 
 
 def normalize_columns(vector: Columns) -> tuple[Columns, Array]:
-    """Unit vector and length, kept as columns; a zero vector gives zeros, with zero gradients.
+    """Unit vector and length, kept as columns; a zero vector gives zeros, with zero gradients."""
+    unit, length, _ = _normalized(vector)
+    return unit, length
 
-    Lengths are taken relative to the largest component, so that no square over- or underflows; it
-    carries no gradient, for it cancels.
+
+@jax.custom_jvp
+def _normalized(vector: Columns) -> tuple[Columns, Array, Array]:
+    """Also the inverse of the length, 0 of a zero vector.
+
+    Lengths are taken relative to the largest component, so that no square over- or underflows.
     """
-    x, y, z = (jnp.abs(lax.stop_gradient(component)) for component in vector)
+    x, y, z = (jnp.abs(component) for component in vector)
     largest = jnp.maximum(jnp.maximum(x, y), z)
     positive = largest > 0
     inverse = 1 / jnp.where(positive, largest, 1)
     scaled = [component * inverse for component in vector]
-    square = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
+    square = dot_columns(scaled, scaled)
     length = jnp.sqrt(jnp.where(positive, square, 1))
     unit = jnp.where(positive, 1, 0) / length
-    return [component * unit for component in scaled], jnp.where(positive, length * largest, 0)
+    length = jnp.where(positive, length * largest, 0)
+    return [component * unit for component in scaled], length, unit * inverse
+
+
+@_normalized.defjvp
+def _normalized_derivative(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    unit, length, inverse = found = _normalized(*primals)
+    change = [part * inverse for part in tangents[0]]
+    longer = dot_columns(unit, change)
+    turned = [c - longer * u for c, u in zip(change, unit, strict=True)]
+    return found, (turned, longer * length, -inverse * longer)
 
 
 def dot_columns(a: Columns | Array, b: Columns | Array) -> Array:

@@ -84,6 +84,8 @@ def phong(
         if isinstance(light, AmbientLight):
             continue
         direction, factor = incoming(light, surface.position, surface.viewer_distance)
+        # Spread once: the derivative by a light's direction is then summed once over all points.
+        direction = [jnp.broadcast_to(part, zero.shape) for part in direction]
         if part is not None:
             factor = part if factor is None else part * factor
         cosine = dot_columns(normal, direction)

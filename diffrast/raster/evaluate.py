@@ -279,9 +279,11 @@ def _moved(
 
     def turned(matrix: Array) -> Columns:
         """Of a unit vector only the change across it is left."""
-        parts = []
+        parts, shape = [], seen.inverse_depth.shape
+        # Spread once: the derivative by the matrix is then summed once, over all corners.
+        spread = [[jnp.broadcast_to(number, shape) for number in row] for row in matrix]
         for j in range(3):
-            change = stored([_along(row, shares[j]) for row in matrix], seen.inverse_depth)
+            change = stored([_along(row, shares[j]) for row in spread], seen.inverse_depth)
             normal = [column[j] for column in normals]
             length = _along(change, normal)
             parts.append([c - length * n for c, n in zip(change, normal, strict=True)])
