@@ -346,7 +346,7 @@ def _fade(light: SpotLight, to_light: Columns) -> Array:
     """
     axis = normalize(light.direction)
     across = [axis[i] + to_light[i] for i in range(3)]
-    twice_versine = across[0] * across[0] + across[1] * across[1] + across[2] * across[2]
+    twice_versine = dot_columns(across, across)
     half = 2 * jnp.sin(light.cutoff / 2)
     inverse = jnp.where(half == 0, 0, 1) / jnp.where(half == 0, 1, half * half)
     return jnp.where(half == 0, 0, jnp.maximum(1 - twice_versine * inverse, 0))

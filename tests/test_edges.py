@@ -10,8 +10,8 @@ import pytest
 
 import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
-from diffrast.edges import blend
-from diffrast.edges.blend import Method, View, collect
+from diffrast.edges.blend import Method, View
+from diffrast.edges.collect import collect
 from diffrast.edges.derivative import apply_linear
 from diffrast.edges.pieces import (
     CUT_AT_ONCE,
@@ -185,8 +185,8 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
 
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
-    monkeypatch.setattr(blend, "EDGES_AT_ONCE", 64)
-    monkeypatch.setattr(blend, "PIXELS_AT_ONCE", 16)
+    monkeypatch.setattr("diffrast.edges.collect.EDGES_AT_ONCE", 64)
+    monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))
     mesh = dr.mesh.merge([MESH, turned])
     clip = dr.world_to_clip(camera(), mesh.vertices)

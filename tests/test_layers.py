@@ -55,6 +55,7 @@ ORDER = [
     "diffrast.edges.shadow_lines",
     "diffrast.edges.records",
     "diffrast.edges.blend",
+    "diffrast.edges.collect",
     "diffrast.edges.derivative",
     "diffrast.edges.antialias",
     "diffrast.edges",

@@ -13,7 +13,8 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View, collect
+from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
+from diffrast.edges.collect import collect
 from diffrast.edges.derivative import apply_linear, linear_zeros
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrast._selection import batches_of
-from diffrast.edges.blend import Method, View, collect, cropped
+from diffrast.edges.blend import Method, View, cropped
+from diffrast.edges.collect import collect
 from diffrast.edges.records import Records, Start
 
 _ROWS_AT_ONCE = 1024

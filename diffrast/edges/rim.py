@@ -12,7 +12,7 @@ from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
-_SHORT = 1e-3  # pixels: shorter pieces matter no more
+SHORT = 1e-3  # pixels: no piece is left that is shorter
 
 
 class Rim(NamedTuple):
@@ -109,5 +109,5 @@ def _border(centre: Float[Array, " n"], inward: Float[Array, "2 n"]) -> tuple[Ar
     share = (inside[:, 1] - inside[:, 0]) / jnp.where(whole, flat, 1)
     share = jnp.where(whole, share, jnp.where(inside[:, 1] > 0, 1, 0))
     shrinks, grows = share
-    weight = shrinks / jnp.maximum(shrinks - grows, _SHORT)
+    weight = shrinks / jnp.maximum(shrinks - grows, SHORT)
     return (inside[:, 0] + inside[:, 1]) / 2, weight

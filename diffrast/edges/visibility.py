@@ -41,7 +41,7 @@ from diffrast.edges.planes import (
     inverse_depth_slope,
     on_edge,
 )
-from diffrast.edges.rim import Rim, look_inwards
+from diffrast.edges.rim import SHORT, Rim, look_inwards
 
 _BEYOND = 5e-4  # pixels from the edge to the point that shows what is behind it
 _BEFORE = 1e-3  # pixels from the edge to the points that show what hides it, in its face
@@ -49,7 +49,6 @@ _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in t
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
-_SHORT = 1e-3  # pixels: no piece is left that is shorter
 
 BACKGROUND = -2
 
@@ -197,7 +196,7 @@ def look(
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
     exists = pieces.exists & (low < high)
     left = pieces._replace(
-        range=jnp.stack([high, end]), exists=exists & ((end - high) * length > _SHORT)
+        range=jnp.stack([high, end]), exists=exists & ((end - high) * length > SHORT)
     )
     visible, low, high, t, left = stored((exists, low, high, t, left))
     begin, end, middle = stored([start + at * along for at in (low, high, t)])

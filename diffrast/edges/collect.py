@@ -1,0 +1,197 @@
+"""The loops over edges, piercing faces and outlines of shadows that find pieces, and add them."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Int
+
+from diffrast._selection import batches_of, over_batches, prefix_sum
+from diffrast._stored import stored
+from diffrast.edges.blend import (
+    Blended,
+    Method,
+    View,
+    nothing,
+    with_line,
+    with_pieces,
+    with_shadow,
+)
+from diffrast.edges.neighborhood import blocks_with_background
+from diffrast.edges.pieces import (
+    CUT_AT_ONCE,
+    EDGES_AT_ONCE,
+    PIECES_AT_ONCE,
+    Waiting,
+    behind,
+    choose_edges,
+    clip_edges,
+    cut,
+    facing,
+    first_ones,
+    gathered,
+    instead_of_first,
+    none_waiting,
+    to_pixels,
+)
+from diffrast.edges.piercing import (
+    LINES_AT_ONCE,
+    PIXELS_AT_ONCE,
+    choose_pixels,
+    cross,
+    lines_of,
+)
+from diffrast.edges.records import Start, after_batch, has_room
+from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
+from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
+from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
+from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
+from diffrast.edges.visibility import look, uncovered
+
+Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
+
+
+class Work(NamedTuple):
+    """Edges or pixels where there may be pieces: `add(indices, exists, total)` for all batches."""
+
+    order: Int[Array, " list"]
+    size: Int[Array, ""]  # of those on the list
+    at_once: int
+    add: Add
+
+
+def collect(view: View, method: Method, start: Start | None = None) -> Blended:
+    """Find the visible pieces, and the sum of what they add to the image.
+
+    With `start`, the `following` of earlier records, only those are made that begin there.
+    """
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    pixels = to_pixels(view.positions_clip, height, width)
+    volume = facing(pixels, view.faces)
+    if method.cull_backfaces:
+        front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
+        volume = stored(jnp.where(front, volume, 0))
+
+    def is_wanted(total: Blended) -> Array:
+        assert total.records is not None
+        return has_room(total.records)
+
+    goes_on = None if start is None else is_wanted
+    work = [_edges(view, method, pixels, volume, goes_on)]
+    if view.topology.bodies is not None:
+        work.append(_piercing(view, method, pixels, volume))
+    if view.cast is not None:
+        work.append(_shadows(view, view.cast, method, pixels))
+    # Made of the image: else what it is added to would be made, and held, before the image is.
+    zero = stored(work[0].size & 0, view.image[0, 0, 0])
+    blended = nothing(view, method, start, zero)
+    passed = zero
+    for order, size, at_once, add in work:
+
+        def add_batch(indices: Array, exists: Array, total: Blended, add: Add = add) -> Blended:
+            records, sums = add(indices, exists, total)
+            return Blended(records and after_batch(records), sums)
+
+        first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
+        blended = over_batches(
+            order, size, at_once, add_batch, blended, first=first, goes_on=goes_on
+        )
+        passed = passed + batches_of(size, at_once)
+    return blended
+
+
+def _edges(
+    view: View,
+    method: Method,
+    pixels: Array,
+    volume: Array,
+    goes_on: Callable[[Blended], Array] | None,
+) -> Work:
+    """The edges of the mesh; within a batch of them, too, only while `goes_on(total)`."""
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    edges = view.topology.edges
+    order, count = choose_edges(edges, volume, view.apart)
+    bare_blocks = blocks_with_background(view.face_image)
+
+    def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
+        segments = clip_edges(
+            edge, exists, edges, view.faces, pixels, volume, height=height, width=width
+        )
+        ends = prefix_sum(segments.parts)
+        cuts = batches_of(ends[-1], CUT_AT_ONCE)
+
+        def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
+            n, waiting = state
+            pieces = cut(segments, ends, n * CUT_AT_ONCE, height=height, width=width)
+            pieces = uncovered(pieces, segments, view.faces, pixels, view.face_image)
+            return n + 1, behind(waiting, *gathered(pieces))
+
+        def are_few(state: tuple[Array, Waiting]) -> Array:
+            return (state[0] < cuts) & (state[1].total < PIECES_AT_ONCE)
+
+        def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
+            n, waiting = lax.while_loop(are_few, add_cut, state[:2])
+            pieces = first_ones(waiting)
+            found, left = look(
+                pieces,
+                segments,
+                view.faces,
+                pixels,
+                view.topology,
+                volume,
+                view.face_image,
+                bare_blocks,
+            )
+            total = with_pieces(state[2], view, method, segments, pieces, found)
+            return n, instead_of_first(waiting, left), total
+
+        def is_left(state: tuple[Array, Waiting, Blended]) -> Array:
+            left = (state[0] < cuts) | (state[1].total > 0)
+            return left if goes_on is None else left & goes_on(state[2])
+
+        start = ends[-1] & 0, none_waiting(segments), total
+        return lax.while_loop(is_left, add_pieces, start)[2]
+
+    return Work(order, count, EDGES_AT_ONCE, add_edges)
+
+
+def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
+    """The lines along which surfaces pierce each other."""
+    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    assert bodies is not None
+    order, count = choose_pixels(view.face_image, bodies)
+
+    def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
+        pixel = stored(jnp.stack([number % width, number // width]))
+        crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
+
+        def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
+            return with_line(total, view, method, lines_of(crossings, pair, exists))
+
+        return over_batches(crossings.pairs, crossings.total, LINES_AT_ONCE, add_lines, total)
+
+    return Work(order, count, PIXELS_AT_ONCE, add_pixels)
+
+
+def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
+    """The outlines of shadows."""
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    order, count = choose_shadowed(cast)
+
+    def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
+        light = number // (width * height)
+        weight_of_light = pixels.shape[1] - cast.weight.size + light
+        places = Places(
+            light,
+            rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
+            pixel=jnp.stack([number % width, number // width % height]),
+        )
+        outlines = cross_shadows(places, exists, cast, view.faces, pixels, view.face_image)
+
+        def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
+            return with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))
+
+        return over_batches(outlines.lines, outlines.total, SHADOWS_AT_ONCE, add_lines, total)
+
+    return Work(order, count, SHADOWED_AT_ONCE, add_pixels)
