@@ -43,8 +43,7 @@ from diffrast.edges.planes import (
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards
 
-_BEYOND = 5e-4  # pixels from the edge to the point that shows what is behind it
-_BEFORE = 1e-3  # pixels from the edge to the points that show what hides it, in its face
+_ROUNDINGS = 8  # of a position, from the edge to the point that shows what is behind it
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
@@ -99,7 +98,8 @@ def uncovered(
     )
     along = ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    aside = along * (_BEFORE / jnp.where(length > 0, length, 1))
+    inside, _ = _beside_edge(face_image.shape, length.dtype)
+    aside = along * (inside / jnp.where(length > 0, length, 1))
     sides = jnp.stack([-aside, aside])
     x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
     y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
@@ -171,7 +171,8 @@ def look(
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
-    offset = jnp.stack([-jnp.minimum(_BEFORE, thickness / 2) * out, _BEYOND * out], axis=1)
+    inside, outside = _beside_edge(face_image.shape, length.dtype)
+    offset = jnp.stack([-jnp.minimum(inside, thickness / 2) * out, outside * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     x, y = stored((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
     around_corners = corners_of(around, faces, pixels)
@@ -239,7 +240,7 @@ def look(
     shown = picked(pictured, beyond_look)
     start = _seen_nearest(fold & before, pictured, middle)
     leave = jnp.stack([start, jnp.where(search, shown, -1)])
-    leave, (x, y) = stored((leave, centre + middle + _BEYOND * out))
+    leave, (x, y) = stored((leave, centre + middle + outside * out))
     reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
     reached = stored(jnp.where(arrives | (leave >= 0), reached, beyond))
@@ -296,6 +297,15 @@ def look(
         middle=t,
     )
     return seen, left
+
+
+def _beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:
+    """Pixels from edges to the points that show what hides them, inside, and what is beyond.
+
+    As few as rounding leaves certain: where fine surfaces fold, others lie as near.
+    """
+    outside = _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape)
+    return 2 * outside, outside
 
 
 def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Array:
