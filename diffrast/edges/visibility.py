@@ -43,7 +43,8 @@ from diffrast.edges.planes import (
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards
 
-_ROUNDINGS = 8  # of a position, from the edge to the point that shows what is behind it
+_BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
+_ROUNDINGS = 8  # of a position, if that is more
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
@@ -304,7 +305,7 @@ def _beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float
 
     As few as rounding leaves certain: where fine surfaces fold, others lie as near.
     """
-    outside = _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape)
+    outside = max(_BEYOND, _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape))
     return 2 * outside, outside
 
 
