@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from diffrast.linalg import apply_matrix
+
 
 @jax.jit
 def affine(
@@ -54,8 +56,7 @@ def _affine_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Ar
 
 
 def _plain_affine(matrix: Array, remainder: Array, points: Array) -> Array:
-    products = (points[..., axis, None] * matrix[:, axis] for axis in range(3))
-    return sum(products, start=matrix[:, 3] + remainder)
+    return apply_matrix(matrix[:, :3], points) + (matrix[:, 3] + remainder)
 
 
 def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:

@@ -78,9 +78,18 @@ def _derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, A
     return stored_alone(*primals), tangents[0]
 
 
+@jax.custom_jvp
 def stored_rows(values: Array) -> Array:
     """Store a (V, C) array, each of its columns computed once."""
     return assemble(stored([values[:, i] for i in range(values.shape[1])]))
+
+
+@stored_rows.defjvp
+def _rows_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """The ones are made of the rows, which are held anyway, not of the columns."""
+    found = stored_rows(*primals)
+    count = found.shape[1]
+    return found, assemble([stored(tangents[0][:, i], found[:, i]) for i in range(count)])
 
 
 def assemble(channels: list[Array], *, first: bool = False) -> Array:

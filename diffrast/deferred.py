@@ -125,7 +125,7 @@ def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
 
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     data, drawn, face, reached = inputs[:4]
-    runs, seen = _covered_runs(face), _in_runs(face, -1)
+    runs, seen = _covered_runs(face), face.reshape(-1)
     parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
@@ -136,7 +136,7 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     def pixels_of(chosen: Array) -> Pixels:
         number = chosen[..., None] * RUN + jnp.arange(RUN)
         number = number.reshape(*chosen.shape[:-1], -1)
-        own = seen.at[chosen].get(mode="fill", fill_value=-1).reshape(number.shape)
+        own = seen.at[number].get(mode="fill", fill_value=-1)
         pixels = pixels_at(own, *jnp.divmod(number, face.shape[1]), face.shape, dtype)
         return pixels._replace(x=stored(pixels.x), y=stored(pixels.y))
 

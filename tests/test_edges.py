@@ -158,14 +158,23 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
     clip[:, 2] -= 2 * near
     faces = jnp.arange(300).reshape(-1, 3)
     pixels = to_pixels(jnp.asarray(clip, jnp.float32), size, size)
-    exact = np.asarray(pixels, np.float64)
+    z = jnp.asarray(clip[:, 2], jnp.float32)
+    exact = np.asarray(jnp.stack([*pixels[:2], z, pixels[2]]), np.float64)
     volume = facing(pixels, faces)
     truth = np.linalg.det(exact[[0, 1, 3]].T[np.asarray(faces)])
     np.testing.assert_allclose(volume, truth, rtol=1e-3)
 
     edges = traced_topology(jnp.asarray(clip, jnp.float32), faces).edges
     found = clip_edges(
-        jnp.arange(300), jnp.ones(300, bool), edges, faces, pixels, volume, height=size, width=size
+        jnp.arange(300),
+        jnp.ones(300, bool),
+        edges,
+        faces,
+        pixels,
+        z,
+        volume,
+        height=size,
+        width=size,
     )
     start, end = exact[:, np.asarray(found.vertices)].swapaxes(0, 1)
     x, y, z, w = start

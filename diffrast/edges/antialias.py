@@ -148,6 +148,8 @@ def antialias_image(
     method = Method(shader, glow, cull_backfaces, capacity)
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
+    if view.topology.bodies is None and view.cast is None:  # only lines in which planes meet move
+        scale = lax.stop_gradient(scale)
     positions_clip = view.positions_clip * scale[:, None]
     if view.cast is not None:
         cast, rows = with_lights(view.cast, depth)
@@ -182,8 +184,7 @@ def antialias_image(
         assert records is not None
         assert sums is not None
         assert sums.rims is not None
-        x, y, _, w = to_pixels(d_clip, height, width)
-        points = jnp.stack([x, y, w], axis=-1)
+        points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels)
         d_out = apply_linear(now, method, records, sums.rims, points, colors)
         return with_edges(image, sums), d_out.reshape(height, width, channels)

@@ -67,7 +67,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     With `start`, the `following` of earlier records, only those are made that begin there.
     """
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    pixels = to_pixels(view.positions_clip, height, width)
+    pixels = stored(to_pixels(view.positions_clip, height, width))
     volume = facing(pixels, view.faces)
     if method.cull_backfaces:
         front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
@@ -112,11 +112,12 @@ def _edges(
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     edges = view.topology.edges
     order, count = choose_edges(edges, volume, view.apart)
+    z = stored(view.positions_clip[:, 2])
     bare_blocks = blocks_with_background(view.face_image)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
-            edge, exists, edges, view.faces, pixels, volume, height=height, width=width
+            edge, exists, edges, view.faces, pixels, z, volume, height=height, width=width
         )
         ends = prefix_sum(segments.parts)
         cuts = batches_of(ends[-1], CUT_AT_ONCE)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from diffrast._selection import batches_of
+from diffrast._stored import stored
 from diffrast.edges.blend import Method, View, cropped
 from diffrast.edges.collect import collect
 from diffrast.edges.records import Records, Start
@@ -19,11 +20,19 @@ from diffrast.edges.records import Records, Start
 _ROWS_AT_ONCE = 1024
 
 
-def _over_rows(records: Records, add: Callable[[Array, Any, Any], Any], start: Any) -> Any:
-    """Add up what each block of rows contributes; `used` masks the rows behind the last."""
+def _over_rows(
+    records: Records,
+    add: Callable[[Array, Any, Any], Any],
+    start: Any,
+    applies: Array | bool = True,
+) -> Any:
+    """Add up what each block of rows contributes; `used` masks the rows behind the last.
+
+    Where it does not apply no row does: of a condition the branches would copy what they add to.
+    """
     capacity = records.jump.shape[0]
     rows_at_once = min(_ROWS_AT_ONCE, capacity)
-    count = jnp.minimum(records.total - records.row, capacity)
+    count = jnp.where(applies, jnp.minimum(records.total - records.row, capacity), 0)
 
     def step(n: Array, total: Any) -> Any:
         used = n * rows_at_once + jnp.arange(rows_at_once) < count
@@ -52,8 +61,8 @@ def _over_pieces(
         which, start, total = state
         found = collect(view, method, start).records
         assert found is not None
-        branches = [lambda total, add=add: _over_rows(found, add, total) for add in adds]
-        total = lax.switch(which, branches, total)
+        for n, add in enumerate(adds):
+            total = _over_rows(found, add, total, which == n)
         ended = found.following.row >= records.total
         following = jax.tree.map(
             lambda again, next: jnp.where(ended, again, next), records.following, found.following
@@ -114,6 +123,8 @@ def _pull(
     """The transpose of `_push`: what a change of the image means for `points` and `colors`."""
     rim = rims > 0
     inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
+    # What the cotangent is made of need not be held any longer, then.
+    cotangent = stored(cotangent, cropped(view.image, view.image.shape))
     own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
     own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(rim.size, -1)
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._selection import compacted, prefix_sum, selected
 from diffrast._stored import stored
 from diffrast._topology import Edges
-from diffrast.edges.planes import FINE_TOLERANCE, cross_rows, largest, nearest_first
+from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
 EDGES_AT_ONCE = 4096
 CUT_AT_ONCE = 1024
@@ -53,13 +53,13 @@ class Pieces(NamedTuple):
     exists: Bool[Array, " n"]
 
 
-def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Float[Array, "4 V"]:
-    """Clip coordinates to homogeneous pixel coordinates, by rows.
+def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Table:
+    """Clip coordinates to homogeneous pixel coordinates x, y, w.
 
-    x / w lies right of the image's left border, y / w below its upper one; z and w stay.
+    x / w lies right of the image's left border, y / w below its upper one; w stays.
     """
-    x, y, z, w = positions_clip.T
-    return jnp.stack([(x + w) * (width / 2), (w - y) * (height / 2), z, w])
+    x, y, _, w = positions_clip.T
+    return jnp.stack([(x + w) * (width / 2), (w - y) * (height / 2), w])
 
 
 class Depth(NamedTuple):
@@ -101,14 +101,14 @@ def scale_by_depth(depth: Depth, positions_clip: Float[Array, "V 4"]) -> Float[A
     return 1 / jnp.where(known, depth.weight(safe), 1)
 
 
-def facing(pixels: Float[Array, "4 V"], faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
+def facing(pixels: Table, faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     """Volume det(v0, v1, v2) of x, y, w: negative on front faces, as y points down.
 
     Zero for faces seen edge-on, as far as rounding can tell, and for those with a vertex at the
     eye. But if their outlines touch, as those of faces without area do, they count as front faces:
     so one of the faces beside them has an outline there, and not both.
     """
-    first, second, third = nearest_first(stored(pixels[jnp.array([0, 1, 3])][:, faces.T]))
+    first, second, third = nearest_first(stored([pixels[:, column] for column in faces.T]))
     one, other = second - first, third - first
     cycles = [(i, (i + 1) % 3, (i + 2) % 3) for i in range(3)]
     terms = [first[i] * one[j] * other[k] for i, j, k in cycles]
@@ -155,23 +155,27 @@ def clip_edges(
     exists: Bool[Array, " n"],
     edges: Edges,
     faces: Int[Array, "F 3"],
-    pixels: Float[Array, "4 V"],
+    pixels: Table,
+    z: Float[Array, " V"],
     volume: Float[Array, " F"],
     *,
     height: int,
     width: int,
 ) -> Segments:
-    """Clip edges to the view and project them. `volume` as in `choose_edges`."""
+    """Clip edges to the view, by x, y, w in pixels and z, and project them.
+
+    `volume` as in `choose_edges`.
+    """
     edges = Edges(*(column[chosen] for column in edges))
     drawn, right, fold = _sides(edges, volume)
     corners = edges.corners.T
     vertices = stored(faces[edges.faces[:, 0], jnp.stack([corners[0] // 3, corners[0] % 3])])
-    at = stored(pixels[:, vertices])  # (4, 2, n)
+    at, z = stored((pixels[:, vertices], z[vertices]))  # (3, 2, n), (2, n)
 
-    x, y, z, w = at
+    x, y, w = at
     heights = [w + z, w - z, x, width * w - x, y, height * w - y]
     inside = jnp.stack(positive_part([h[0] for h in heights], [h[1] for h in heights]))
-    first, last = at[jnp.array([0, 1, 3])].swapaxes(0, 1)
+    first, last = at.swapaxes(0, 1)
     rest = jnp.stack(positive_part([h[1] for h in heights], [h[0] for h in heights])[::-1])
     clipped = rest * first[:, None] + inside * last[:, None]  # (x, y, w; 2 ends; n)
     weights = jnp.where(clipped[2] > 0, 1 / jnp.where(clipped[2] > 0, clipped[2], 1), 0)

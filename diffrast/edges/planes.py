@@ -14,7 +14,7 @@ TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
 
 Columns = list[Float[Array, "*n"]]
-Table = Float[Array, "4 V"]  # vertices in homogeneous pixel coordinates x, y, z, w
+Table = Float[Array, "3 V"]  # vertices in homogeneous pixel coordinates x, y, w
 
 
 def cross_rows(a: Array, b: Array) -> Array:
@@ -29,17 +29,17 @@ def largest(vectors: Array) -> Array:
     return jnp.maximum(jnp.maximum(abs(vectors[0]), abs(vectors[1])), abs(vectors[2]))
 
 
-def nearest_first(corners: Array) -> tuple[Array, Array, Array]:
-    """The three corners of faces (x, y, w; corner; ...) in turn, beginning with the smallest.
+def nearest_first(corners: list[Array]) -> tuple[Array, Array, Array]:
+    """The three corners of faces, each (x, y, w; ...), in turn, beginning with the smallest.
 
     What is computed from the differences to a corner near the eye loses nothing.
     """
-    size = largest(corners)
+    size = [largest(corner) for corner in corners]
     second = (size[1] < size[0]) & (size[1] <= size[2])
     third = (size[2] < size[0]) & (size[2] < size[1])
 
     def turned(first: int) -> Array:
-        one, two, three = (corners[:, (first + k) % 3] for k in range(3))
+        one, two, three = (corners[(first + k) % 3] for k in range(3))
         return jnp.where(third, three, jnp.where(second, two, one))
 
     return turned(0), turned(1), turned(2)
@@ -47,7 +47,7 @@ def nearest_first(corners: Array) -> tuple[Array, Array, Array]:
 
 def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) -> Array:
     """x, y and w of the three corners of faces, shape (3, 3, *n)."""
-    return stored(pixels[jnp.array([0, 1, 3])][:, stored(faces.T[:, jnp.maximum(face, 0)])])
+    return stored(pixels[:, stored(faces.T[:, jnp.maximum(face, 0)])])
 
 
 def edge_values(

@@ -142,7 +142,7 @@ def cross_shadows(
 
     def place(vertex: Array) -> Array:
         """x, y and w of vertices, from the pixel's centre."""
-        x, y, w = pixels[jnp.array([0, 1, 3])][:, vertex]
+        x, y, w = pixels[:, vertex]
         return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
 
     row, column = pixel[1] + _FIRST[:, None] // 3, pixel[0] + _FIRST[:, None] % 3

@@ -337,7 +337,7 @@ def _thickness(
 ) -> Array:
     """How far a face reaches from the point `t` of its edge, at right angles to it, or less."""
     third = 3 - edge // 3 - edge % 3
-    x, y, _, w = pixels[:, stored(faces[jnp.maximum(face, 0), third])]
+    x, y, w = pixels[:, stored(faces[jnp.maximum(face, 0), third])]
     inverse_w = 1 / jnp.where(w > 0, w, 1)
     x, y = x * inverse_w - start[0], y * inverse_w - start[1]
     height = jnp.abs(x * normal[0] + y * normal[1])

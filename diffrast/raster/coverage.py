@@ -102,7 +102,7 @@ def _draw(
             )
         span = starts[LARGE], starts[LARGE + 1]
         buffer = _draw_sweeps(buffer, vertices, faces, order, span, image, cull_backfaces)
-        return _face_ids(buffer)[:height, :width], buffer.real[:height, :width]
+        return stored(_face_ids(buffer)[:height, :width]), buffer.real[:height, :width]
 
     return draw(positions_clip, faces)
 

@@ -251,14 +251,16 @@ def _moved(
     """How world position and normal of fixed points change as objects are placed elsewhere."""
     placed, b = drawn.placed, seen.barycentrics
     assert placed is not None
-    own_object = jnp.where(pixels.face >= 0, placed.object_of_face[jnp.maximum(pixels.face, 0)], -1)
+    covered = pixels.face >= 0
+    several = len(changes) > 1
+    object_of = placed.object_of_face[jnp.maximum(pixels.face, 0)] if several else 0
 
     def of_each(matrices: list[Any], change_by: Callable[[Array], Columns]) -> Columns | None:
         """The change by the matrix of the object that a pixel sees, of those that change."""
         columns = None
         for number, matrix in enumerate(matrices):
             if not isinstance(matrix, SymbolicZero):
-                here = own_object == number
+                here = covered & (object_of == number)
                 others = columns or [jnp.zeros_like(seen.inverse_depth)] * 3
                 parts = zip(change_by(matrix), others, strict=True)
                 columns = [jnp.where(here, part, other) for part, other in parts]
