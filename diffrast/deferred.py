@@ -77,7 +77,7 @@ def shade_covered(
         points: what the pixels see, if that is known: without attributes and without a derivative.
     """
     inputs = _Inputs(data, drawn, face, reached, background, points)
-    if not in_batches or face.size <= LARGE:
+    if not comes_held(face, in_batches):
         return _in_one_go(shade, inputs._replace(points=None))
 
     @jax.custom_jvp
@@ -104,6 +104,11 @@ def shade_covered(
 
     colors.defjvp(derivative, symbolic_zeros=True)
     return colors(inputs)
+
+
+def comes_held(face: Array, in_batches: bool) -> bool:
+    """Whether `shade_covered` returns colours out of a condition, each in a buffer of its own."""
+    return in_batches and face.size > LARGE
 
 
 def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
@@ -150,8 +155,12 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     def no_colors(batch: Any) -> Columns:
         return [jnp.zeros(RUNS_AT_ONCE * RUN, dtype) + 0 * runs.total] * 3
 
+    # The reverse pass begins each batch anew, in a condition: what that would hand over to the
+    # next one, of the transpose, are all values in between, or the tables of few faces.
+    again = shade_batch if many else jax.checkpoint(shade_batch, prevent_cse=False)
+
     def step(batch: Any) -> Columns:
-        return lax.cond(batch[0] < runs.total, shade_batch, no_colors, batch)
+        return lax.cond(batch[0] < runs.total, again, no_colors, batch)
 
     first = jnp.arange(chosen.shape[0]) * RUNS_AT_ONCE + 0 * runs.total
     colors = lax.map(jax.checkpoint(step, prevent_cse=False), (first, chosen, carried, parts))
