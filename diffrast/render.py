@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from diffrast._check import instance_of
 from diffrast._stored import assemble, stored, stored_alone
 from diffrast.camera import Camera, central_rays
-from diffrast.deferred import shade_covered
+from diffrast.deferred import comes_held, shade_covered
 from diffrast.edges import Glow, Shader, View, antialias_image
 from diffrast.geometry import (
     Points,
@@ -139,14 +139,15 @@ def render(
             in_batches=in_batches,
             points=None if world.shadows is None else pixels,
         )
+        held = comes_held(face, in_batches)
     if settings.antialias:
         with jax.named_scope("edges"):
-            image = assemble([stored_alone(channel) for channel in color])
+            image = assemble([stored_alone(channel) for channel in color], held=held)
             image = _with_edges(image, world, clip, pixels, reached, background, settings)
         if side == 1:
             return image
-        color = [image[..., c] for c in range(3)]
-    return _pixels(color, side)
+        color, held = [image[..., c] for c in range(3)], False
+    return _pixels(color, side, held)
 
 
 @jax.jit
@@ -307,8 +308,10 @@ def _background(scene: Scene, camera: Camera, settings: RenderSettings, border: 
     return jnp.pad(background, ((border, border), (border, border), (0, 0)), mode="edge")
 
 
-def _pixels(color: Columns, side: int) -> Array:
-    """The image of pixels from the colours of side × side samples of each."""
+def _pixels(color: Columns, side: int, held: bool = False) -> Array:
+    """The image of pixels from the colours of side × side samples of each; see `assemble`."""
+    if side == 1 and held:
+        return assemble(color, held=True)
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
     # A loop over views would else compute the colours where it puts them into place, on one core.
