@@ -167,8 +167,10 @@ def test_temporary_memory_is_not_mapped_anew_at_each_call():
     """More than 32 MB are given back after each call, and the next one maps every page again."""
     options = dr.RenderSettings(height=512, width=512)
     shadowed = scene(light=dataclasses.replace(SUN, shadow=dr.Shadow(resolution=512)))
+    fine = dr.Object(dr.shapes.icosphere(6), dr.Material(**SHINY))
     for program, arguments in (
         gradient(scene(), "camera", options),
+        gradient(dr.Scene(objects=[fine], lights=[SUN]), "camera", options),
         (jax.jit(dr.render), (shadowed, CAMERA, options)),
     ):
         memory = program.lower(*arguments).compile().memory_analysis()
