@@ -155,8 +155,9 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     def no_colors(batch: Any) -> Columns:
         return [jnp.zeros(RUNS_AT_ONCE * RUN, dtype) + 0 * runs.total] * 3
 
-    # The reverse pass begins each batch anew, in a condition: what that would hand over to the
-    # next one, of the transpose, are all values in between, or the tables of few faces.
+    # The reverse pass repeats a batch in one condition and transposes it in another; what the
+    # first hands to the second is copied. With a checkpoint of its own that is no value in
+    # between, but all tables that the batch reads: less where there are few faces.
     again = shade_batch if many else jax.checkpoint(shade_batch, prevent_cse=False)
 
     def step(batch: Any) -> Columns:

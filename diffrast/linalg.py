@@ -296,7 +296,7 @@ def where_finite(function: Callable[[Array], Array], vectors: Array) -> Array:
     # One by one: of a constant XLA folds a reduction some hundred times as slowly.
     parts = [jnp.isfinite(vectors[..., i]) for i in range(vectors.shape[-1])]
     finite = functools.reduce(operator.and_, parts)
-    finite = (stored(finite.astype(jnp.int8)) > 0)[..., None]  # not the vectors, for the transpose
+    finite = (stored(finite.astype(jnp.int8)) > 0)[..., None]  # which the transpose holds
     return jnp.where(finite, function(jnp.where(finite, vectors, 0)), jnp.nan)
 
 

@@ -148,7 +148,8 @@ def antialias_image(
     method = Method(shader, glow, cull_backfaces, capacity)
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
-    if view.topology.bodies is None and view.cast is None:  # only lines in which planes meet move
+    if view.topology.bodies is None and view.cast is None:
+        # It moves nothing but lines in which planes meet.
         scale = lax.stop_gradient(scale)
     positions_clip = view.positions_clip * scale[:, None]
     if view.cast is not None:
