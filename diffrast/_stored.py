@@ -92,13 +92,17 @@ def _rows_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arr
     return found, assemble([stored(tangents[0][:, i], found[:, i]) for i in range(count)])
 
 
-def assemble(channels: list[Array], *, first: bool = False, held: bool = False) -> Array:
-    """Stack channels along a new last axis, or a new first one, each computed once.
+def interleaved(channels: list[Array]) -> Array:
+    """Stack channels along a new last axis in one pass, and store them.
 
-    In one pass if they are held already, as what comes out of a loop or a condition is.
+    For those that are in buffers already, as what comes out of a loop or a condition is: what
+    others have in common would be computed again for each.
     """
-    if held:
-        return stored_alone(jnp.stack(channels, axis=0 if first else -1))
+    return stored_alone(jnp.stack(channels, axis=-1))
+
+
+def assemble(channels: list[Array], *, first: bool = False) -> Array:
+    """Stack channels along a new last axis, or a new first one, each computed once."""
     shape, count = channels[0].shape, len(channels)
     image = jnp.zeros((count, *shape) if first else (*shape, count), channels[0].dtype)
     for c, channel in enumerate(channels):

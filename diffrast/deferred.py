@@ -107,7 +107,7 @@ def shade_covered(
 
 
 def comes_held(face: Array, in_batches: bool) -> bool:
-    """Whether `shade_covered` returns colours out of a condition, each in a buffer of its own."""
+    """Whether the colours of `shade_covered` come out of a condition: each in a buffer."""
     return in_batches and face.size > LARGE
 
 

@@ -267,7 +267,7 @@ def scene_topology(scene: Scene) -> Topology:
     first_vertices = np.cumsum([0] + [m.vertices.shape[0] for m in meshes])
 
     def moved(faces: Array, by: int) -> Array:
-        return jnp.where(faces >= 0, faces + by, -1) if by else jnp.asarray(faces)
+        return jnp.where(faces >= 0, faces + by, -1) if by else faces
 
     edges = [
         part.edges._replace(faces=moved(part.edges.faces, int(first)))

@@ -226,7 +226,7 @@ def _applied(matrix: Array, vectors: Array) -> Array:
 
 
 @functools.partial(_applied.defjvp, symbolic_zeros=True)
-def _applied_derivative(primals: Any, tangents: Any) -> tuple[Array, Any]:
+def _applied_derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """The same, so written that XLA's CPU transposes it in one pass over the vectors.
 
     By vectors each number of the matrix for itself: of whole rows the transpose holds one copy a
@@ -241,8 +241,7 @@ def _applied_derivative(primals: Any, tangents: Any) -> tuple[Array, Any]:
         parts.append(jnp.stack(moved, axis=-1))
     if not isinstance(d_matrix, SymbolicZero):
         parts.append(_matmul(vectors, d_matrix.T))
-    result = _applied(matrix, vectors)
-    return result, _sum(parts) if parts else SymbolicZero.from_primal_value(result)
+    return _applied(matrix, vectors), _sum(parts)
 
 
 def _sum(terms: Iterable[Array]) -> Array:

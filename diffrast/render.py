@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast._check import instance_of
-from diffrast._stored import assemble, stored, stored_alone
+from diffrast._stored import assemble, interleaved, stored, stored_alone
 from diffrast.camera import Camera, central_rays
 from diffrast.deferred import comes_held, shade_covered
 from diffrast.edges import Glow, Shader, View, antialias_image
@@ -142,12 +142,14 @@ def render(
         held = comes_held(face, in_batches)
     if settings.antialias:
         with jax.named_scope("edges"):
-            image = assemble([stored_alone(channel) for channel in color], held=held)
+            image = interleaved(color) if held else assemble([stored_alone(c) for c in color])
             image = _with_edges(image, world, clip, pixels, reached, background, settings)
         if side == 1:
             return image
-        color, held = [image[..., c] for c in range(3)], False
-    return _pixels(color, side, held)
+        color = [image[..., c] for c in range(3)]
+    elif side == 1 and held:
+        return interleaved(color)
+    return _pixels(color, side)
 
 
 @jax.jit
@@ -308,10 +310,8 @@ def _background(scene: Scene, camera: Camera, settings: RenderSettings, border: 
     return jnp.pad(background, ((border, border), (border, border), (0, 0)), mode="edge")
 
 
-def _pixels(color: Columns, side: int, held: bool = False) -> Array:
-    """The image of pixels from the colours of side × side samples of each; see `assemble`."""
-    if side == 1 and held:
-        return assemble(color, held=True)
+def _pixels(color: Columns, side: int) -> Array:
+    """The image of pixels from the colours of side × side samples of each."""
     if side > 1:
         color = [_box_average(channel, side) for channel in color]
     # A loop over views would else compute the colours where it puts them into place, on one core.

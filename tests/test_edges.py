@@ -159,9 +159,9 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
     faces = jnp.arange(300).reshape(-1, 3)
     pixels = to_pixels(jnp.asarray(clip, jnp.float32), size, size)
     z = jnp.asarray(clip[:, 2], jnp.float32)
-    exact = np.asarray(jnp.stack([*pixels[:2], z, pixels[2]]), np.float64)
+    exact = np.asarray(jnp.stack([*pixels, z]), np.float64)
     volume = facing(pixels, faces)
-    truth = np.linalg.det(exact[[0, 1, 3]].T[np.asarray(faces)])
+    truth = np.linalg.det(exact[:3].T[np.asarray(faces)])
     np.testing.assert_allclose(volume, truth, rtol=1e-3)
 
     edges = traced_topology(jnp.asarray(clip, jnp.float32), faces).edges
@@ -177,8 +177,8 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
         width=size,
     )
     start, end = exact[:, np.asarray(found.vertices)].swapaxes(0, 1)
-    x, y, z, w = start
-    dx, dy, dz, dw = end - start
+    x, y, w, z = start
+    dx, dy, dw, dz = end - start
     # Inside the frustum a + t b >= 0.
     planes = [(w + z, dw + dz), (x, dx), (y, dy), (size * w - x, size * dw - dx)]
     planes += [(w - z, dw - dz), (size * w - y, size * dw - dy)]
@@ -188,7 +188,7 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
     seen = np.asarray(found.parts) > 0
     assert np.sum(seen) > 100
     at = [start + np.clip(t, 0, 1) * (end - start) for t in (low, high)]
-    wanted = np.stack([p[:2] / p[3] for p in at])
+    wanted = np.stack([p[:2] / p[2] for p in at])
     np.testing.assert_allclose(found.ends[..., seen], wanted[..., seen], atol=1e-3)
 
 
