@@ -37,10 +37,11 @@ def stored(values: T, witness: Array | None = None) -> T:
 
 
 def _one(witness: Array, dtype: jnp.dtype) -> Array:
-    """A one that XLA takes for another number until it has fused."""
+    """A one that XLA takes for another number until it has fused: of integers it would know."""
     same = lax.stop_gradient(witness)
-    is_number = (same < 0) | (same >= 0) | (same != same)
-    return jnp.where(is_number, 1, 2).astype(dtype)
+    if not jnp.issubdtype(same.dtype, jnp.inexact):
+        same = same.astype(jnp.float32)
+    return lax.select(same < same, lax.full_like(same, 2, dtype), lax.full_like(same, 1, dtype))
 
 
 def _divided(value: Array) -> Array:

@@ -5,6 +5,7 @@ only, and shades. What a scene does not hold is not computed: see `RenderSetting
 each stage.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from diffrast._check import instance_of
 from diffrast._stored import assemble, interleaved, stored, stored_alone
 from diffrast.camera import Camera, central_rays
 from diffrast.deferred import comes_held, shade_covered
-from diffrast.edges import Glow, Shader, View, antialias_image
+from diffrast.edges import View, antialias_image
 from diffrast.geometry import (
     Points,
     apart_edges,
@@ -270,25 +271,21 @@ def _with_edges(
     )
     return antialias_image(
         view,
-        shader=_shade_points(settings.shading),
-        glow=_glow_at(settings.shading),
+        shader=partial(_shade_points, shading=settings.shading),
+        glow=partial(_glow_at, shading=settings.shading),
         cull_backfaces=settings.cull_backfaces,
     )
 
 
-def _shade_points(shading: str) -> Shader:
-    def shade(world: World, face: Array, at: Columns) -> Columns:
-        points = Points(face, at, jnp.zeros_like(at[0]))
-        return SHADERS[shading](world, points, receive_shadows(world, points))
-
-    return shade
+@partial(jax.jit, static_argnames="shading")
+def _shade_points(world: World, face: Array, at: Columns, *, shading: str) -> Columns:
+    points = Points(face, at, jnp.zeros_like(at[0]))
+    return SHADERS[shading](world, points, receive_shadows(world, points))
 
 
-def _glow_at(shading: str) -> Glow:
-    def shade(world: World, light: Array, face: Array, at: Columns) -> Columns:
-        return glow(shading, world, light, Points(face, at, jnp.zeros_like(at[0])))
-
-    return shade
+@partial(jax.jit, static_argnames="shading")
+def _glow_at(world: World, light: Array, face: Array, at: Columns, *, shading: str) -> Columns:
+    return glow(shading, world, light, Points(face, at, jnp.zeros_like(at[0])))
 
 
 def _background(scene: Scene, camera: Camera, settings: RenderSettings, border: int) -> Array:

@@ -10,6 +10,7 @@ number one larger: so piece k of a line is found without walking along it, all a
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -101,6 +102,7 @@ def scale_by_depth(depth: Depth, positions_clip: Float[Array, "V 4"]) -> Float[A
     return 1 / jnp.where(known, depth.weight(safe), 1)
 
 
+@jax.jit
 def facing(pixels: Table, faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     """Volume det(v0, v1, v2) of x, y, w: negative on front faces, as y points down.
 
@@ -150,6 +152,7 @@ def choose_edges(
     return selected(chosen)
 
 
+@partial(jax.jit, static_argnames=("height", "width"))
 def clip_edges(
     chosen: Int[Array, " n"],
     exists: Bool[Array, " n"],
@@ -217,6 +220,7 @@ def _forward(ends: Array) -> tuple[Array, Array]:
     return start - jnp.floor(start), end - start
 
 
+@partial(jax.jit, static_argnames=("height", "width"))
 def cut(
     segments: Segments, ends: Int[Array, " n"], first_piece: Array, *, height: int, width: int
 ) -> Pieces:

@@ -87,6 +87,7 @@ def _two_bodies(body: Array) -> tuple[Array, Array]:
     return one, jnp.minimum(first_row(differs), last)
 
 
+@jax.jit
 def cross(
     pixel: Int[Array, "2 n"],
     exists: Bool[Array, " n"],
@@ -180,6 +181,7 @@ def _left_of(normal: Array) -> Array:
     return jnp.stack([-normal[1], normal[0]])
 
 
+@jax.jit
 def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, " n"]) -> Line:
     """The lines along which these pairs of faces pierce each other, where they are visible."""
     at_once = crossings.unit.size

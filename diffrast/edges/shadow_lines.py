@@ -128,6 +128,7 @@ def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
     return selected((right | below).reshape(-1))
 
 
+@jax.jit
 def cross_shadows(
     places: Places,
     exists: Bool[Array, " n"],
@@ -215,6 +216,7 @@ def cross_shadows(
     )
 
 
+@jax.jit
 def shadow_of(
     outlines: Outlines,
     line: Int[Array, " n"],

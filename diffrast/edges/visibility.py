@@ -10,6 +10,7 @@ which of its faces does, or that it ends before.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -77,6 +78,7 @@ class Seen(NamedTuple):
     middle: Float[Array, " n"]  # of the part on the clipped edge, as seen on the screen
 
 
+@jax.jit
 def uncovered(
     pieces: Pieces,
     segments: Segments,
@@ -115,6 +117,7 @@ def uncovered(
     return pieces._replace(exists=pieces.exists & ~hidden)
 
 
+@jax.jit
 def look(
     pieces: Pieces,
     segments: Segments,

@@ -60,6 +60,7 @@ class _Way(NamedTuple):
     central: Bool[Array, " n"]  # whether they come from the nearest texel
 
 
+@jax.jit
 def lit(
     pictures: Pictures, geometry: Geometry, neighbors: Int[Array, "F 3"], rays: Rays
 ) -> Float[Array, " n"]:
