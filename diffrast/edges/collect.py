@@ -8,7 +8,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Int
 
 from diffrast._selection import batches_of, over_batches, prefix_sum
-from diffrast._stored import stored
+from diffrast._stored import stored, zero_after
 from diffrast.edges.blend import (
     Blended,
     Method,
@@ -78,13 +78,13 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
         return has_room(total.records)
 
     goes_on = None if start is None else is_wanted
-    work = [_edges(view, method, pixels, volume, goes_on)]
+    # Shadows first: what they are found by need not be held any longer, then.
+    work = [] if view.cast is None else [_shadows(view, view.cast, method, pixels)]
+    work.append(_edges(view, method, pixels, volume, goes_on))
     if view.topology.bodies is not None:
         work.append(_piercing(view, method, pixels, volume))
-    if view.cast is not None:
-        work.append(_shadows(view, view.cast, method, pixels))
-    # Made of the image: else what it is added to would be made, and held, before the image is.
-    zero = stored(work[0].size & 0, view.image[0, 0, 0])
+    # Else what it is added to would be made, and held, before the image and the lists are.
+    zero = stored(zero_after(work[0].size), view.image[0, 0, 0])
     blended = nothing(view, method, start, zero)
     passed = zero
     for order, size, at_once, add in work:

@@ -14,6 +14,8 @@ do, the point seen at a place of the screen moves along the line of sight.
 """
 
 import itertools
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import jax
@@ -26,7 +28,14 @@ from diffrast._selection import selected
 from diffrast._stored import stored
 from diffrast.edges.neighborhood import first_row
 from diffrast.edges.pieces import Depth, positive_part
-from diffrast.edges.planes import Columns, Table, barycentrics, cross_rows, edge_functions
+from diffrast.edges.planes import (
+    Columns,
+    Table,
+    barycentrics,
+    cross_rows,
+    edge_functions,
+    largest,
+)
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
@@ -178,7 +187,7 @@ def cross_shadows(
         chosen = chosen | jnp.any(linked & chosen, axis=1)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
     first = jnp.sum(jnp.where(primary, outwards, 0), axis=1)
-    chosen = chosen | (valid & (jnp.sum(outwards * first[:, None], axis=0) < _OPPOSITE))
+    chosen = chosen | (valid & (_dot(outwards, first[:, None]) < _OPPOSITE))
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
     sign = jnp.where(ground.offset < 0, -1, 1)
@@ -306,7 +315,8 @@ def shadow_of(
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return jnp.sum(a * b, axis=0)
+    """Row by row: a reduction of so few would be a call into a library."""
+    return reduce(add, [x * y for x, y in zip(a, b, strict=True)])
 
 
 def _nonzero(value: Array) -> Array:
@@ -321,7 +331,7 @@ def _of_screen(motion: Array, pixel: Array) -> Array:
 
 def _through(normal: Array, place: Array) -> _Plane:
     """The plane through a place; its normal is scaled to a largest component of one."""
-    normal = stored(normal / _nonzero(jnp.max(jnp.abs(normal), axis=0)))
+    normal = stored(normal / _nonzero(largest(normal)))
     return _Plane(normal, -_dot(normal, place))
 
 
@@ -358,12 +368,16 @@ def _line(ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
     """
     line = _meet(ground, shadow)
     steepness = jnp.hypot(line[0], line[1])
-    size = jnp.max(jnp.abs(shadow.normal[:2]), axis=0) * jnp.abs(ground.offset)
-    size = size + jnp.max(jnp.abs(ground.normal[:2]), axis=0) * jnp.abs(shadow.offset)
+    size = _larger(shadow.normal) * jnp.abs(ground.offset)
+    size = size + _larger(ground.normal) * jnp.abs(shadow.offset)
     steep = steepness > _ROUNDINGS * jnp.finfo(line.dtype).eps * size
     inverse = 1 / jnp.where(steep, steepness, 1)
     normal = line[:2] * inverse
     return normal, -line[2] * inverse * normal, jnp.where(steep, inverse, 0)
+
+
+def _larger(normal: Array) -> Array:
+    return jnp.maximum(jnp.abs(normal[0]), jnp.abs(normal[1]))
 
 
 def _same_place(end: Array, others: list[Array]) -> Array:

@@ -20,15 +20,17 @@ from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
-from diffrast.shadows.maps import Pictures, Smooth
+from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import (
     ROUNDINGS,
     Line,
     Rays,
     Texel,
+    at_texels,
     cut_by,
     face_corners,
     line_of,
+    number_of,
     texel_of,
     texels_round,
 )
@@ -46,6 +48,7 @@ class _Sight(NamedTuple):
     """What is known of rays from the keys alone."""
 
     line: Line
+    texels: Int[Array, "9 n"]  # numbers of the nine round each
     slopes: Float[Array, "2 n"]  # of the keys on the faces on which they begin
     before: Float[Array, "9 n"]  # by how much the nine texels show more than the faces' planes
 
@@ -66,7 +69,7 @@ def lit(
 ) -> Float[Array, " n"]:
     """1 where a light sees points that are asked for, 0 elsewhere. Not differentiable."""
     texel = texel_of(pictures, rays)
-    floor, slope_x, slope_y = _at_texels(pictures.smooth, rays.picture, texel)
+    floor, slope_x, slope_y = _smooth_at(pictures, rays.picture, texel)
     least = floor + slope_x * texel.x + slope_y * texel.y
     bright = rays.asked & (rays.key >= least - _rounding(rays))
     order, count = selected(rays.asked & jnp.isinf(floor))
@@ -87,10 +90,9 @@ def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
     return stored(jax.tree.map(lambda column: column[..., chosen], columns))
 
 
-def _at_texels(smooth: Smooth, picture: Array, texel: Texel) -> list[Array]:
-    size = smooth.floor.shape[1]
-    number = stored((picture * size + texel.row) * size + texel.column)
-    return [values.reshape(-1)[number] for values in smooth]
+def _smooth_at(pictures: Pictures, picture: Array, texel: Texel) -> list[Array]:
+    number = number_of(pictures, picture, texel.row, texel.column)
+    return [at_texels(values, number) for values in pictures.smooth]
 
 
 def _rounding(rays: Rays) -> Array:
@@ -100,12 +102,13 @@ def _rounding(rays: Rays) -> Array:
 def _sight(pictures: Pictures, geometry: Geometry, rays: Rays) -> _Sight:
     own = face_corners(geometry, rays.face)
     texel, nine = texel_of(pictures, rays), jnp.arange(9)[:, None]
-    key = pictures.key[rays.picture, *texels_round(pictures, texel)]
+    texels = texels_round(pictures, rays, texel)
+    key = at_texels(pictures.key, texels)
     slopes, _ = _slopes(pictures, rays, own)
     along_row = slopes[0] * (texel.x - (nine % 3 - 1))
     along_column = slopes[1] * (texel.y - (nine // 3 - 1))
     before = (key - rays.key) + along_row + along_column - _rounding(rays)
-    return _Sight(line_of(pictures, rays, own), jnp.stack(slopes), before)
+    return _Sight(line_of(pictures, rays, own), texels, jnp.stack(slopes), before)
 
 
 def _hidden(
@@ -127,10 +130,9 @@ def _hidden(
     count, nine = doubt.size, jnp.arange(9)[:, None]
 
     def begin(way: Array) -> _Way:
-        ray, texel = way % count, way // count
-        place = texels_round(pictures, texel_of(pictures, _entries(rays, ray)), texel)
-        face = pictures.face[rays.picture[ray], *place]
-        return _Way(ray, face, jnp.zeros_like(rays.key[ray]), jnp.zeros_like(way), texel == 4)
+        face = at_texels(pictures.face, stored(sight.texels.reshape(-1)[way]))
+        zero = jnp.zeros_like(way)
+        return _Way(way % count, face, zero.astype(rays.key.dtype), zero, way // count == 4)
 
     def walk(way: _Way, goes: Array, fate: Array) -> tuple[_Way, Array, Array]:
         own = rays.face[way.ray]
@@ -177,7 +179,7 @@ def _is_hidden_by_small(
     margin for surfaces that curve from one to the other.
     """
     texel = texel_of(pictures, rays)
-    faces = pictures.face[rays.picture, *texels_round(pictures, texel)]
+    faces = at_texels(pictures.face, sight.texels)
     slopes, area = _slopes(pictures, rays, face_corners(geometry, faces[4]))
     margin = jnp.abs((slopes[0] - sight.slopes[0]) * texel.x)
     margin = margin + jnp.abs((slopes[1] - sight.slopes[1]) * texel.y)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
@@ -76,14 +76,25 @@ def texel_of(pictures: Pictures, rays: Rays) -> Texel:
     return Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
 
 
-def texels_round(
-    pictures: Pictures, texel: Texel, which: Int[Array, "*n"] | None = None
-) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]:
-    """Rows and columns of the 3×3 texels round some, or of one of these nine by its number."""
-    last = pictures.face.shape[1] - 1
-    which = jnp.arange(9)[:, None] if which is None else which
-    row = jnp.clip(texel.row + which // 3 - 1, 0, last)
-    return row, jnp.clip(texel.column + which % 3 - 1, 0, last)
+def number_of(
+    pictures: Pictures, picture: Int[Array, " n"], row: Int[Array, "*n"], column: Int[Array, "*n"]
+) -> Int[Array, "*n"]:
+    """Numbers of texels, as `at_texels` wants them."""
+    size = pictures.face.shape[1]
+    return stored((picture * size + row) * size + column)
+
+
+def at_texels(values: Shaped[Array, "pictures size size"], number: Int[Array, "*n"]) -> Array:
+    """What pictures show at texels."""
+    return values.reshape(-1)[number]
+
+
+def texels_round(pictures: Pictures, rays: Rays, texel: Texel) -> Int[Array, "9 n"]:
+    """Numbers of the 3×3 texels round those in which rays begin."""
+    last, nine = pictures.face.shape[1] - 1, jnp.arange(9)[:, None]
+    row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
+    column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
+    return number_of(pictures, rays.picture, row, column)
 
 
 def line_of(pictures: Pictures, rays: Rays, own: Float[Array, "3 3 n"]) -> Line:
@@ -99,13 +110,13 @@ def line_of(pictures: Pictures, rays: Rays, own: Float[Array, "3 3 n"]) -> Line:
 
 def faces_near(pictures: Pictures, geometry: Geometry, rays: Rays, line: Line) -> Nearby:
     """The faces at the 3×3 texels round rays, and which of them stop these."""
-    texels = rays.picture, *texels_round(pictures, texel_of(pictures, rays))
-    around = stored(pictures.face[texels])
+    texels = texels_round(pictures, rays, texel_of(pictures, rays))
+    around = stored(at_texels(pictures.face, texels))
     others = face_corners(geometry, around)
     cut = cut_by(Line(*(column[..., None, :] for column in line)), others)
     foreign = (around >= 0) & (around != rays.face)
     cut = cut._replace(stops=jnp.where(foreign, cut.stops, -1))
-    return Nearby(around, pictures.key[texels], others, cut)
+    return Nearby(around, at_texels(pictures.key, texels), others, cut)
 
 
 def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:
