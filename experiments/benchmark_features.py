@@ -58,6 +58,7 @@ def variants() -> dict[str, Variant]:
     checks = jnp.asarray(np.repeat(0.3 + 0.6 * squares[..., None], 3, axis=2), jnp.float32)
     edges = {"antialias": True}
     lamp = (dr.PointLight(**LAMP),)
+    shadow = (dr.DirectionalLight(**SUN, shadow=dr.Shadow(resolution=512)),)
     return {
         "plain": Variant(),
         "culled back faces": Variant(settings={"cull_backfaces": True}),
@@ -67,7 +68,7 @@ def variants() -> dict[str, Variant]:
         "attenuation": Variant(
             lights=(dr.PointLight(**LAMP, attenuation=(0.5, 0.1, 0.05)),), base="point light"
         ),
-        "shadow": Variant(lights=(dr.DirectionalLight(**SUN, shadow=dr.Shadow(resolution=512)),)),
+        "shadow": Variant(lights=shadow),
         **{
             f"texture, {kind}": Variant(material={"texture": dr.Texture(checks, filter=kind)})
             for kind in ("nearest", "bilinear", "trilinear")
@@ -77,6 +78,7 @@ def variants() -> dict[str, Variant]:
         "unlit": Variant(settings={"shading": "unlit"}),
         "4 samples": Variant(settings={"samples": 4}),
         "edges": Variant(settings=edges),
+        "shadow, edges": Variant(lights=shadow, settings=edges, base="edges"),
         "nothing in view": Variant(aside=30.0),
         "nothing in view, edges": Variant(aside=30.0, settings=edges, base="edges"),
     }

@@ -1,4 +1,8 @@
-"""The loops over edges, piercing faces and outlines of shadows that find pieces, and add them."""
+"""The loops over edges, piercing faces and outlines of shadows that find pieces, and add them.
+
+A picture's derivative holds these loops twice, and JAX traces them four times: so what they do with
+a batch is under `jax.jit`, which traces it once.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
