@@ -8,9 +8,9 @@ and with the derivative of a weighted sum of the picture by the camera's eye, th
 translation and the light's colour. What a feature costs is its time less the plain scene's.
 
 Expected: a second light, a highlight, "gouraud" and "flat" within a few milliseconds of the plain
-scene; "unlit" a third of it; edges and shadows two to three times as much, 4 samples more than
-four times. With everything outside of the picture it should take less than a tenth, and does not:
-every pixel is shaded all the same, but in pictures of more than 90,000 pixels.
+scene; "unlit" a third of it; edges or a shadow about twice as much, both more than three times, 4
+samples more than four times. With everything outside of the picture it should take less than a
+tenth, and does not: every pixel is shaded all the same, but in pictures of more than 90,000 pixels.
 
 Written to `--out`: `benchmark_features.json`, `.md` and `.png`.
 """

@@ -171,6 +171,7 @@ def test_temporary_memory_is_not_mapped_anew_at_each_call():
     for program, arguments in (
         gradient(scene(), "camera", options),
         gradient(dr.Scene(objects=[fine], lights=[SUN]), "camera", options),
+        (jax.jit(dr.render), (shadowed, CAMERA, options)),
         gradient(shadowed, "lights", options),
     ):
         memory = program.lower(*arguments).compile().memory_analysis()

@@ -2,7 +2,5 @@
 
 from diffrast.edges.antialias import antialias as antialias
 from diffrast.edges.antialias import antialias_image as antialias_image
-from diffrast.edges.blend import Glow as Glow
-from diffrast.edges.blend import Shader as Shader
 from diffrast.edges.blend import View as View
 from diffrast.edges.shadow_lines import Cast as Cast

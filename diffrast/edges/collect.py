@@ -87,7 +87,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     work.append(_edges(view, method, pixels, volume, goes_on))
     if view.topology.bodies is not None:
         work.append(_piercing(view, method, pixels, volume))
-    # Else what it is added to would be made, and held, before the image and the lists are.
+    # Else what it is added to would be made, and held, before the image and the first list are.
     zero = stored(zero_after(work[0].size), view.image[0, 0, 0])
     blended = nothing(view, method, start, zero)
     passed = zero

@@ -4,6 +4,8 @@ All in homogeneous coordinates x, y, w of the corners, so that faces may reach b
 and relative to the point, so that small faces far from the image's origin lose nothing.
 """
 
+from functools import reduce
+
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -25,8 +27,8 @@ def cross_rows(a: Array, b: Array) -> Array:
 
 
 def largest(vectors: Array) -> Array:
-    """The largest size of the three components, which are rows."""
-    return jnp.maximum(jnp.maximum(abs(vectors[0]), abs(vectors[1])), abs(vectors[2]))
+    """The largest size of the components, which are rows."""
+    return reduce(jnp.maximum, [abs(row) for row in vectors])
 
 
 def nearest_first(corners: list[Array]) -> tuple[Array, Array, Array]:

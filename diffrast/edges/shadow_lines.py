@@ -368,16 +368,12 @@ def _line(ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
     """
     line = _meet(ground, shadow)
     steepness = jnp.hypot(line[0], line[1])
-    size = _larger(shadow.normal) * jnp.abs(ground.offset)
-    size = size + _larger(ground.normal) * jnp.abs(shadow.offset)
+    size = largest(shadow.normal[:2]) * jnp.abs(ground.offset)
+    size = size + largest(ground.normal[:2]) * jnp.abs(shadow.offset)
     steep = steepness > _ROUNDINGS * jnp.finfo(line.dtype).eps * size
     inverse = 1 / jnp.where(steep, steepness, 1)
     normal = line[:2] * inverse
     return normal, -line[2] * inverse * normal, jnp.where(steep, inverse, 0)
-
-
-def _larger(normal: Array) -> Array:
-    return jnp.maximum(jnp.abs(normal[0]), jnp.abs(normal[1]))
 
 
 def _same_place(end: Array, others: list[Array]) -> Array:
