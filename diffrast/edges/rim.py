@@ -8,7 +8,15 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast.edges.neighborhood import picked, pixel_at
-from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
+from diffrast.edges.planes import (
+    FINE_TOLERANCE,
+    Columns,
+    Table,
+    barycentrics,
+    corners_of,
+    edge_values,
+    locate,
+)
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
@@ -37,6 +45,8 @@ def look_inwards(
     pictured: Int[Array, "9 n"],
     patches: Int[Array, " F"],
     front_look: Int[Array, " n"],
+    near: Float[Array, " n"],
+    depths: Float[Array, "9 n"],
     middle: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
     centre: Float[Array, "2 n"],
@@ -51,6 +61,8 @@ def look_inwards(
         pictured: faces at the 3×3 pixels.
         patches: of each face.
         front_look: see `Side`.
+        near: 1/w of the middle of the piece.
+        depths: 1/w there of the planes of the faces at the 3×3 pixels.
         middle: of the piece, from the pixel's centre.
         inward: unit normal towards the face in front.
         centre: of the pixel, on the screen.
@@ -60,10 +72,17 @@ def look_inwards(
     exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
     depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
     inner = stored(pixel_at(middle, inward, depth + 0.5))
-    step = jnp.stack([inner % 3 - 1, inner // 3 - 1])
-    next_face = stored(picked(pictured, inner))
-    ours = jnp.stack([picked(pictured, front_look), next_face])
+    looks = jnp.stack([front_look, inner])
+    ours = stored(jnp.stack([picked(pictured, front_look), picked(pictured, inner)]))
     same = (ours >= 0) & (patches[jnp.maximum(ours, 0)] == patches[jnp.maximum(front, 0)])
+    next_face = ours[1]
+    # A surface comes nearer from its rim inwards: what lies farther is another part of it.
+    step = jnp.stack([looks % 3 - 1, looks // 3 - 1])  # (x and y, two pixels, n)
+    x, y = centre[:, None] + step - BESIDE * inward[:, None]
+    values, inverse_w = edge_values(corners_of(ours, faces, pixels), x, y)
+    there = jnp.stack([picked(depths, front_look), picked(depths, inner)])
+    same = same & (jnp.maximum(inverse_w, there) > near * (1 - FINE_TOLERANCE))
+    beside = barycentrics([value[1] for value in values])
 
     first = jnp.minimum(thickness, depth)
     beyond = jnp.where(thickness >= depth, front, next_face)
@@ -71,8 +90,6 @@ def look_inwards(
     x, y = (centre + middle)[:, None] + jnp.stack([first, depth]) * inward[:, None]
     covered, at = locate(corners_of(face, faces, pixels), x, y)
     bend = [jnp.clip(b[0], 0, 1) for b in at]
-    x, y = centre + step - BESIDE * inward
-    beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
     own_depth = -jnp.sum(middle * inward, axis=0)
     border, weight = _border(own_depth, inward)
@@ -85,7 +102,7 @@ def look_inwards(
         far=(beyond, [b[1] for b in at]),
         single=covered[1],
         beside=(next_face, beside),
-        inner_depth=own_depth + jnp.sum(step * inward, axis=0),
+        inner_depth=own_depth + jnp.sum(step[:, 1] * inward, axis=0),
         border=stored(border),
         weight=stored(weight),
     )

@@ -238,12 +238,14 @@ def look(
 
     # Two walks over the surface to the point just beyond: from where a surface is seen that would
     # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond.
-    # If that ends before, and there are empty pixels not far away, the background is bare.
+    # If that ends before, and there are empty pixels not far away, the background is bare. If
+    # nothing is seen beyond, a surface seen elsewhere may end there.
     search = fold & ~found
     bare = pictured < 0
     shown = picked(pictured, beyond_look)
-    start = _seen_nearest(fold & before, pictured, middle)
-    leave = jnp.stack([start, jnp.where(search, shown, -1)])
+    after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE))
+    start = _seen_nearest(jnp.stack([fold & before, search & after]), pictured, middle)
+    leave = jnp.stack([start[0], jnp.where(search & (shown >= 0), shown, start[1])])
     leave, (x, y) = stored((leave, centre + middle + outside * out))
     reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
@@ -276,6 +278,8 @@ def look(
         pictured,
         topology.patches,
         front_look,
+        near,
+        depths,
         middle,
         -out,
         centre,
@@ -324,8 +328,9 @@ def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
     nine = jnp.arange(9)[:, None]
     x, y = nine % 3 - 1 - point[0], nine // 3 - 1 - point[1]
     distance = stored(jnp.where(mask, x * x + y * y, jnp.inf))
-    best = first_row(mask & (distance == jnp.min(distance, axis=0)))
-    return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
+    nearest = mask & (distance == jnp.min(distance, axis=1, keepdims=True))
+    best = jnp.min(jnp.where(nearest, nine, 9), axis=1)
+    return jnp.where(best < 9, jnp.take_along_axis(pictured, jnp.minimum(best, 8), axis=0), -1)
 
 
 def _thickness(
