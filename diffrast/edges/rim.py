@@ -52,6 +52,8 @@ def look_inwards(
     centre: Float[Array, "2 n"],
     faces: Int[Array, "F 3"],
     pixels: Table,
+    neighbors: Int[Array, "F 3"],
+    volume: Float[Array, " F"],
 ) -> Rim:
     """What the faces in front show from the middle of pieces inwards.
 
@@ -68,6 +70,8 @@ def look_inwards(
         centre: of the pixel, on the screen.
         faces: corners of faces.
         pixels: see `to_pixels`.
+        neighbors: of faces.
+        volume: see `look`.
     """
     exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
     depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
@@ -90,11 +94,16 @@ def look_inwards(
     x, y = (centre + middle)[:, None] + jnp.stack([first, depth]) * inward[:, None]
     covered, at = locate(corners_of(face, faces, pixels), x, y)
     bend = [jnp.clip(b[0], 0, 1) for b in at]
+    # Where the face ends, a narrow one may fold again.
+    out = jnp.argmin(jnp.stack(bend), axis=0)
+    following = neighbors[jnp.maximum(front, 0), out]
+    faces_alike = volume[jnp.maximum(following, 0)] * jnp.sign(volume[jnp.maximum(front, 0)]) > 0
+    goes_on = (thickness >= depth) | ((following >= 0) & faces_alike)
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
     own_depth = -jnp.sum(middle * inward, axis=0)
     border, weight = _border(own_depth, inward)
     return Rim(
-        smooth=(front >= 0) & same[0] & same[1],
+        smooth=(front >= 0) & same[0] & same[1] & goes_on,
         inner=inner,
         depth=depth,
         first=first,

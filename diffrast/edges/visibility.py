@@ -285,6 +285,8 @@ def look(
         centre,
         faces,
         pixels,
+        topology.neighbors,
+        volume,
     )
     rim = rim._replace(smooth=rim.smooth & fold)
 
