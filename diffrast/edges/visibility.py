@@ -237,15 +237,17 @@ def look(
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # Two walks over the surface to the point just beyond: from where a surface is seen that would
-    # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond.
-    # If that ends before, and there are empty pixels not far away, the background is bare. If
-    # nothing is seen beyond, a surface seen elsewhere may end there.
+    # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond
+    # or, if that does not lie behind, from the nearest one that does. If its surface ends before,
+    # and there are empty pixels not far away, the background is bare.
     search = fold & ~found
     bare = pictured < 0
     shown = picked(pictured, beyond_look)
     after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE))
-    start = _seen_nearest(jnp.stack([fold & before, search & after]), pictured, middle)
-    leave = jnp.stack([start[0], jnp.where(search & (shown >= 0), shown, start[1])])
+    masks = jnp.stack([fold & before, search & after])
+    start, other_start = _seen_nearest(masks, pictured, middle, middle + _LOOK * out)
+    is_behind = picked(after, beyond_look) | (other_start < 0)
+    leave = jnp.stack([start, jnp.where(is_behind, jnp.where(search, shown, -1), other_start)])
     leave, (x, y) = stored((leave, centre + middle + outside * out))
     reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
@@ -325,12 +327,13 @@ def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Arra
     return jnp.where(picked(same, look) | (first == 9), look, first)
 
 
-def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
-    """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
+def _seen_nearest(masks: Array, pictured: Array, *points: Array) -> Array:
+    """What the pixels of the 3×3 show whose centres are nearest to points, of masks; or -1."""
     nine = jnp.arange(9)[:, None]
-    x, y = nine % 3 - 1 - point[0], nine // 3 - 1 - point[1]
-    distance = stored(jnp.where(mask, x * x + y * y, jnp.inf))
-    nearest = mask & (distance == jnp.min(distance, axis=1, keepdims=True))
+    x, y = jnp.stack(points, axis=1)[:, :, None]
+    x, y = nine % 3 - 1 - x, nine // 3 - 1 - y
+    distance = stored(jnp.where(masks, x * x + y * y, jnp.inf))
+    nearest = masks & (distance == jnp.min(distance, axis=1, keepdims=True))
     best = jnp.min(jnp.where(nearest, nine, 9), axis=1)
     return jnp.where(best < 9, jnp.take_along_axis(pictured, jnp.minimum(best, 8), axis=0), -1)
 
