@@ -217,9 +217,10 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     def results(capacity):
         method = Method(None, None, False, capacity)
         records, sums = collect(view, method)
+        found = view._replace(unseen=sums.unseen)
 
         def change(points, colors):
-            return apply_linear(view, method, records, sums.rims, points, colors)
+            return apply_linear(found, method, records, sums.rims, points, colors)
 
         points = jnp.ones((len(clip), 3)) * 0.1
         colors = jnp.ones((face.size, 3)) * jnp.arange(3.0)

@@ -187,6 +187,7 @@ def antialias_image(
         assert sums.rims is not None
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels)
+        now = now._replace(unseen=sums.unseen)
         d_out = apply_linear(now, method, records, sums.rims, points, colors)
         return with_edges(image, sums), d_out.reshape(height, width, channels)
 

@@ -49,6 +49,7 @@ class View(NamedTuple):
     scene: Any  # passed on to the shader
     scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
+    unseen: Int[Array, " pixels"] | None = None  # see `Sums`
 
 
 class Method(NamedTuple):
@@ -74,6 +75,8 @@ class Sums(NamedTuple):
     added: Float[Array, "pixels channels"]
     range: tuple[Array, Array]  # least and greatest colours that each pixel holds
     rims: Float[Array, " pixels_with_border"] | None  # length of smooth rims about pixels' centres
+    # Where there are several bodies: a face that an edge shows, but no centre round it; or -1.
+    unseen: Int[Array, " pixels"] | None
 
 
 class Blended(NamedTuple):
@@ -125,7 +128,10 @@ def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Ble
     if start is not None:
         return Blended(records, None)
     own = cropped(view.image, view.image.shape)
-    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims))
+    unseen = None
+    if view.topology.bodies is not None:
+        unseen = jnp.full(own.shape[0], -1, view.face_image.dtype) + zero
+    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims, unseen))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
@@ -197,6 +203,10 @@ def with_pieces(
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
     if sums is not None and sums.rims is not None:
         sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
+    if sums is not None and sums.unseen is not None:
+        face = stored(jnp.where(found.visible & found.unseen, found.front.face, -1))
+        place = pieces.pixel[1] * (view.image.shape[1] - 2) + pieces.pixel[0]
+        sums = sums._replace(unseen=sums.unseen.at[place].max(face))
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),

@@ -68,7 +68,8 @@ class Work(NamedTuple):
 def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     """Find the visible pieces, and the sum of what they add to the image.
 
-    With `start`, the `following` of earlier records, only those are made that begin there.
+    With `start`, the `following` of earlier records, only those are made that begin there; then the
+    view needs what the `Sums` found to be `unseen`.
     """
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     pixels = stored(to_pixels(view.positions_clip, height, width))
@@ -85,23 +86,27 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     # Shadows first: what they are found by need not be held any longer, then.
     work = [] if view.cast is None else [_shadows(view, view.cast, method, pixels)]
     work.append(_edges(view, method, pixels, volume, goes_on))
-    if view.topology.bodies is not None:
-        work.append(_piercing(view, method, pixels, volume))
     # Else what it is added to would be made, and held, before the image and the first list are.
     zero = stored(zero_after(work[0].size), view.image[0, 0, 0])
-    blended = nothing(view, method, start, zero)
-    passed = zero
-    for order, size, at_once, add in work:
 
-        def add_batch(indices: Array, exists: Array, total: Blended, add: Add = add) -> Blended:
-            records, sums = add(indices, exists, total)
+    def with_batches(blended: Blended, passed: Array, work: Work) -> tuple[Blended, Array]:
+        def add_batch(indices: Array, exists: Array, total: Blended) -> Blended:
+            records, sums = work.add(indices, exists, total)
             return Blended(records and after_batch(records), sums)
 
         first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
-        blended = over_batches(
-            order, size, at_once, add_batch, blended, first=first, goes_on=goes_on
-        )
-        passed = passed + batches_of(size, at_once)
+        batches = work.order, work.size, work.at_once
+        blended = over_batches(*batches, add_batch, blended, first=first, goes_on=goes_on)
+        return blended, passed + batches_of(work.size, work.at_once)
+
+    blended, passed = nothing(view, method, start, zero), zero
+    for part in work:
+        blended, passed = with_batches(blended, passed, part)
+    if view.topology.bodies is not None:
+        unseen = view.unseen if blended.sums is None else blended.sums.unseen
+        assert unseen is not None
+        piercing = _piercing(view, method, pixels, volume, unseen)
+        blended, _ = with_batches(blended, passed, piercing)
     return blended
 
 
@@ -161,15 +166,17 @@ def _edges(
     return Work(order, count, EDGES_AT_ONCE, add_edges)
 
 
-def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
+def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: Array) -> Work:
     """The lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
-    order, count = choose_pixels(view.face_image, bodies)
+    order, count = choose_pixels(view.face_image, bodies, unseen)
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = stored(jnp.stack([number % width, number // width]))
-        crossings = cross(pixel, exists, view.faces, pixels, view.topology, volume, view.face_image)
+        crossings = cross(
+            pixel, exists, view.faces, pixels, view.topology, volume, view.face_image, unseen
+        )
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
             return with_line(total, view, method, lines_of(crossings, pair, exists))

@@ -83,13 +83,14 @@ def walk(
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or
     turns away. Also whether the end of the way was reached.
     """
+    facing = stored(jnp.sign(volume[jnp.maximum(face, 0)]))
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         steps, face, there = state
         values = jnp.stack(edge_values(corners_of(face, faces, pixels), x, y)[0])
         known = jnp.maximum(face, 0)
         beside = stored(neighbors.T[:, known])
-        goes_on = volume[jnp.maximum(beside, 0)] * jnp.sign(volume[known]) > 0
+        goes_on = volume[jnp.maximum(beside, 0)] * facing > 0
         way = stored(jnp.where((beside >= 0) & goes_on, jnp.minimum(values, 0), 0))
         best = (way < 0) & (way == jnp.min(way, axis=0))
         following = jnp.max(jnp.where(best, beside, -1), axis=0)

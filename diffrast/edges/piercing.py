@@ -3,8 +3,9 @@
 The 1/w of a plane is linear on the screen, and so is the difference of that of two faces: where it
 is zero they meet, along a straight line, with the one in front on this side and the other on that.
 The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
-faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, and those next
-to one of each of two bodies. A surface that pierces itself is not found.
+faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, those next to
+one of each of two bodies, and one of which an edge is visible in the pixel, but nothing at any of
+these centres. A surface that pierces itself is not found.
 
 With homogeneous corners V, a point p of the screen (x, y, 1) is the sum of λ V, the λ linear in p
 and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, and c · V = 1 at each
@@ -31,15 +32,15 @@ LINES_AT_ONCE = 128
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
-_FACES = 9 + 2 * 3
+_FACES = 9 + 2 * 3 + 1
 
 
 class _Planes(NamedTuple):
-    """Faces that may be seen at each pixel, shape (15, n); from the pixel's centre."""
+    """Faces that may be seen at each pixel, shape (16, n); from the pixel's centre."""
 
     face: Array
     look: Array  # 0 to 8: pixel of the 3×3 whose colour changes as this face's
-    lambdas: Array  # (3, 3 corners, 15, n): at the centre in units of the largest sum, slopes
+    lambdas: Array  # (3, 3 corners, 16, n): at the centre in units of the largest sum, slopes
     known: Array  # neither edge-on nor there already
 
 
@@ -67,16 +68,21 @@ class Line(NamedTuple):
 
 
 def choose_pixels(
-    face_image: Int[Array, "height_with_border width_with_border"], bodies: Int[Array, " F"]
-) -> tuple[Int[Array, " pixels"], Int[Array, ""]]:
-    """Indices of the pixels round which two bodies are seen, in ascending order, and how many."""
+    face_image: Int[Array, "height_with_border width_with_border"],
+    bodies: Int[Array, " F"],
+    unseen: Int[Array, " pixels"],
+) -> tuple[Int[Array, " list"], Int[Array, ""]]:
+    """Indices of the pixels round which two bodies are seen, in ascending order, and how many.
+
+    Also of those that show a face, `unseen`, only beside their centres; -1 where there is none.
+    """
     body = jnp.where(face_image >= 0, bodies[jnp.maximum(face_image, 0)], -1)
     largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
     largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
     largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
     least = jnp.minimum(jnp.minimum(least[:-2], least[1:-1]), least[2:])
     least = jnp.minimum(jnp.minimum(least[:, :-2], least[:, 1:-1]), least[:, 2:])
-    return selected((largest > least).reshape(-1))
+    return selected((largest > least).reshape(-1) | (unseen >= 0))
 
 
 def _two_bodies(body: Array) -> tuple[Array, Array]:
@@ -96,13 +102,16 @@ def cross(
     topology: Topology,
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
+    unseen: Int[Array, " pixels"],
 ) -> Crossings:
     """Find which faces near pixels (column, row) may pierce each other there, seen or not.
 
     Those that reach into the pixel, and whose planes meet within it.
     """
     assert topology.bodies is not None
-    face, look, body = _candidates(pixel, topology.bodies, topology.neighbors, volume, face_image)
+    face, look, body = _candidates(
+        pixel, topology.bodies, topology.neighbors, volume, face_image, unseen
+    )
     planes, unit = _planes(pixel, face, look, faces, pixels)
     value, *slopes = planes.lambdas
     reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
@@ -116,7 +125,12 @@ def cross(
 
 
 def _candidates(
-    pixel: Array, bodies: Array, neighbors: Array, volume: Array, face_image: Array
+    pixel: Array,
+    bodies: Array,
+    neighbors: Array,
+    volume: Array,
+    face_image: Array,
+    unseen: Array,
 ) -> tuple[Array, Array, Array]:
     """Faces, the pixels of the 3×3 where they or faces next to them are seen, and their bodies."""
     pictured = stored(pixels_round(face_image, *pixel))
@@ -129,11 +143,13 @@ def _candidates(
         [
             jnp.broadcast_to(nearest_first[:, None], face.shape),
             jnp.repeat(jnp.asarray(nearest_first)[seen], 3, axis=0),
+            jnp.full_like(face[:1], 4),
         ]
     )
     parents = jnp.stack([picked(face, one), picked(face, other)])
     nearby = neighbors[jnp.maximum(parents, 0)].transpose(0, 2, 1).reshape(6, -1)
-    face = stored(jnp.concatenate([face, only(nearby, volume != 0)]))
+    beside = unseen[pixel[1] * (face_image.shape[1] - 2) + pixel[0]]
+    face = stored(jnp.concatenate([face, only(nearby, volume != 0), beside[None]]))
     return face, look, bodies[jnp.maximum(face, 0)]
 
 

@@ -69,6 +69,7 @@ class Seen(NamedTuple):
     fold: Bool[Array, " n"]
     front_on_right: Bool[Array, " n"]
     front: Side
+    unseen: Bool[Array, " n"]  # whether none of the 3×3 pixels shows the face in front
     beyond: Side
     rim: Rim
     wrong_side: Bool[Array, " n"]  # the centre lies on the edge and shows the face that front hides
@@ -300,6 +301,7 @@ def look(
         fold=fold,
         front_on_right=front_on_right,
         front=Side(front, on_edge(front_corners, s), front_shown),
+        unseen=first_row(pictured == front) == 9,
         beyond=Side(beyond, at_beyond, beyond_look),
         rim=rim,
         wrong_side=wrong_side,
