@@ -446,6 +446,25 @@ def border() -> Problem:
     return Problem([box, ball], eye=(0.2, 0.5, 5.0), target=(0.0, 0.0, 0.0), fov_y=0.45)
 
 
+def hills() -> Problem:
+    """Rough hills, seen from so low that they hide one another; faces of half a pixel and less."""
+    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 97)])
+    heights = 0.15 * np.sin(5 * x) * np.cos(4 * y) + 0.05 * np.sin(13 * x + 9 * y)
+    ground = _object(dr.shapes.height_field(heights), WARM, 1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    camera = {"eye": (0.0, -2.2, 0.8), "target": (0.0, 0.0, 0.0), "up": (0.0, 0.0, 1.0)}
+    return Problem([ground], **camera, fov_y=0.7, nodes=2, lines=32)
+
+
+def shards() -> Problem:
+    """Triangles that pierce one another."""
+    generator = np.random.default_rng(2)
+    corners = generator.uniform(-0.8, 0.8, (100, 1, 3)) + generator.normal(0, 0.3, (100, 3, 3))
+    mesh = dr.Mesh(vertices=corners.reshape(-1, 3), faces=np.arange(300).reshape(-1, 3))
+    heap = _object(dr.mesh.flat_shaded(mesh), WARM, 1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    eye, target = (0.4, 0.9, 5.0), (0.0, 0.0, 0.0)
+    return Problem([heap], eye=eye, target=target, fov_y=0.6, piercing=True, cull_backfaces=False)
+
+
 def crease() -> Problem:
     """A sphere of 320 flat faces."""
     ball = _object(dr.shapes.icosphere(2), WARM, 1.0, (0.3, 0.5, 0.2), (0.05, -0.1, 0.0))
@@ -509,6 +528,8 @@ SCENES: dict[str, Callable[[], Problem]] = {
     "piercing": piercing,
     "border": border,
     "crease": crease,
+    "hills": hills,
+    "shards": shards,
     "shadow_sun": shadow_sun,
     "shadow_lamp": shadow_lamp,
     "shadow_spot": shadow_spot,

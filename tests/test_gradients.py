@@ -50,7 +50,7 @@ def moved_light(light, params):
 
 
 # Scenes whose meshes are padded to one size, so that they have one compiled program in common.
-ALIKE = ("cubes", "piercing", "border", "sphere", "torus2", "lattice")
+ALIKE = ("cubes", "piercing", "border", "sphere", "torus2", "lattice", "shards")
 NOTHING = dr.Mesh(vertices=np.zeros((1, 3)), faces=[[0, 0, 0]], normals=np.ones((1, 3)))
 
 
@@ -142,6 +142,8 @@ BOUNDS = {
     "torus05": (0.027, 0.012, 4e-4),
     "lattice": (0.015, 0.015, 1e-4),
     "piercing": (0.003, 0.02, 1e-5),
+    "hills": (0.09, 0.04, 5.5e-4),
+    "shards": (0.16, 0.045, 5e-4),
     "shadow_sun": (0.01, 0.01, 2e-5),
     "shadow_hidden": (0.002, 0.015, 2e-6),
 }

@@ -4,10 +4,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._selection import compacted, over_batches
 from diffrast._stored import stored
 from diffrast.edges.planes import Table, corners_of, edge_values
 
-_STEPS = 64
+_STEPS = 40
+_WAYS_AT_ONCE = 512
 _BLOCK = 4  # pixels
 
 
@@ -71,8 +73,8 @@ def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
 
 def walk(
     face: Int[Array, "ways n"],
-    x: Float[Array, " n"],
-    y: Float[Array, " n"],
+    x: Float[Array, "ways n"],
+    y: Float[Array, "ways n"],
     faces: Int[Array, "F 3"],
     pixels: Table,
     neighbors: Int[Array, "F 3"],
@@ -83,24 +85,34 @@ def walk(
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or
     turns away. Also whether the end of the way was reached.
     """
-    facing = stored(jnp.sign(volume[jnp.maximum(face, 0)]))
+    shape, number = face.shape, jnp.arange(face.size, dtype=jnp.int32)
+    order, count = compacted((face >= 0).reshape(-1), number)
+    face, x, y = stored((face.reshape(-1), x.reshape(-1), y.reshape(-1)))
 
-    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        steps, face, there = state
-        values = jnp.stack(edge_values(corners_of(face, faces, pixels), x, y)[0])
-        known = jnp.maximum(face, 0)
-        beside = stored(neighbors.T[:, known])
-        goes_on = volume[jnp.maximum(beside, 0)] * facing > 0
-        way = stored(jnp.where((beside >= 0) & goes_on, jnp.minimum(values, 0), 0))
-        best = (way < 0) & (way == jnp.min(way, axis=0))
-        following = jnp.max(jnp.where(best, beside, -1), axis=0)
-        there = there | (face < 0) | jnp.all(values >= 0, axis=0)
-        return steps + 1, *stored((jnp.where(there, face, following), there))
+    def go(way: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        start, to_x, to_y = stored((face[way], x[way], y[way]))
+        facing = stored(jnp.sign(volume[start]))  # the same all the way
 
-    def is_on_the_way(state: tuple[Array, Array, Array]) -> Array:
-        steps, _, there = state
-        return (steps < _STEPS) & ~jnp.all(there)
+        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            steps, face, there = state
+            values = jnp.stack(edge_values(corners_of(face, faces, pixels), to_x, to_y)[0])
+            beside = stored(neighbors.T[:, jnp.maximum(face, 0)])
+            goes_on = volume[jnp.maximum(beside, 0)] * facing > 0
+            aside = stored(jnp.where((beside >= 0) & goes_on, jnp.minimum(values, 0), 0))
+            best = (aside < 0) & (aside == jnp.min(aside, axis=0))
+            following = jnp.max(jnp.where(best, beside, -1), axis=0)
+            there = there | (face < 0) | jnp.all(values >= 0, axis=0)
+            return steps + 1, *stored((jnp.where(there, face, following), there))
 
-    start = jnp.sum(face) & 0, face, face < 0
-    _, face, there = lax.while_loop(is_on_the_way, step, start)
-    return face, there
+        def is_on_the_way(state: tuple[Array, Array, Array]) -> Array:
+            steps, _, there = state
+            return (steps < _STEPS) & ~jnp.all(there)
+
+        _, end, there = lax.while_loop(is_on_the_way, step, (start[0] & 0, start, ~exists))
+        place = jnp.where(exists, way, face.size)
+        ends, arrived = total
+        return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
+
+    nowhere = jnp.minimum(face, -1), face < 0
+    ends, arrived = over_batches(order, count, _WAYS_AT_ONCE, go, nowhere)
+    return ends.reshape(shape), arrived.reshape(shape)

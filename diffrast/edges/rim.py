@@ -8,15 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
 from diffrast.edges.neighborhood import picked, pixel_at
-from diffrast.edges.planes import (
-    FINE_TOLERANCE,
-    Columns,
-    Table,
-    barycentrics,
-    corners_of,
-    edge_values,
-    locate,
-)
+from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
@@ -39,14 +31,21 @@ class Rim(NamedTuple):
     weight: Float[Array, " n"]  # and the first one's weight
 
 
+def next_inwards(
+    middle: Float[Array, "2 n"], inward: Float[Array, "2 n"]
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """How far a pixel reaches from points inwards, and which of the 3×3 is next: see `Rim`."""
+    exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
+    depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
+    return depth, stored(pixel_at(middle, inward, depth + 0.5))
+
+
 def look_inwards(
     front: Int[Array, " n"],
     thickness: Float[Array, " n"],
     pictured: Int[Array, "9 n"],
-    patches: Int[Array, " F"],
-    front_look: Int[Array, " n"],
-    near: Float[Array, " n"],
-    depths: Float[Array, "9 n"],
+    inside: tuple[Float[Array, " n"], Int[Array, " n"]],
+    connected: Bool[Array, " n"],
     middle: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
     centre: Float[Array, "2 n"],
@@ -61,10 +60,8 @@ def look_inwards(
         front: face in front.
         thickness: how far it reaches.
         pictured: faces at the 3×3 pixels.
-        patches: of each face.
-        front_look: see `Side`.
-        near: 1/w of the middle of the piece.
-        depths: 1/w there of the planes of the faces at the 3×3 pixels.
+        inside: what `next_inwards` tells.
+        connected: whether the pixel that shows the front and the next one inwards show its surface.
         middle: of the piece, from the pixel's centre.
         inward: unit normal towards the face in front.
         centre: of the pixel, on the screen.
@@ -73,21 +70,9 @@ def look_inwards(
         neighbors: of faces.
         volume: see `look`.
     """
-    exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
-    depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
-    inner = stored(pixel_at(middle, inward, depth + 0.5))
-    looks = jnp.stack([front_look, inner])
-    ours = stored(jnp.stack([picked(pictured, front_look), picked(pictured, inner)]))
-    same = (ours >= 0) & (patches[jnp.maximum(ours, 0)] == patches[jnp.maximum(front, 0)])
-    next_face = ours[1]
-    # A surface comes nearer from its rim inwards: what lies farther is another part of it.
-    step = jnp.stack([looks % 3 - 1, looks // 3 - 1])  # (x and y, two pixels, n)
-    x, y = centre[:, None] + step - BESIDE * inward[:, None]
-    values, inverse_w = edge_values(corners_of(ours, faces, pixels), x, y)
-    there = jnp.stack([picked(depths, front_look), picked(depths, inner)])
-    same = same & (jnp.maximum(inverse_w, there) > near * (1 - FINE_TOLERANCE))
-    beside = barycentrics([value[1] for value in values])
-
+    depth, inner = inside
+    step = jnp.stack([inner % 3 - 1, inner // 3 - 1])
+    next_face = stored(picked(pictured, inner))
     first = jnp.minimum(thickness, depth)
     beyond = jnp.where(thickness >= depth, front, next_face)
     face = jnp.stack([front, beyond])
@@ -99,11 +84,13 @@ def look_inwards(
     following = neighbors[jnp.maximum(front, 0), out]
     faces_alike = volume[jnp.maximum(following, 0)] * jnp.sign(volume[jnp.maximum(front, 0)]) > 0
     goes_on = (thickness >= depth) | ((following >= 0) & faces_alike)
+    x, y = centre + step - BESIDE * inward
+    beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)
     own_depth = -jnp.sum(middle * inward, axis=0)
     border, weight = _border(own_depth, inward)
     return Rim(
-        smooth=(front >= 0) & same[0] & same[1] & goes_on,
+        smooth=(front >= 0) & connected & goes_on,
         inner=inner,
         depth=depth,
         first=first,
@@ -111,7 +98,7 @@ def look_inwards(
         far=(beyond, [b[1] for b in at]),
         single=covered[1],
         beside=(next_face, beside),
-        inner_depth=own_depth + jnp.sum(step[:, 1] * inward, axis=0),
+        inner_depth=own_depth + jnp.sum(step * inward, axis=0),
         border=stored(border),
         weight=stored(weight),
     )

@@ -42,12 +42,13 @@ from diffrast.edges.planes import (
     inverse_depth_slope,
     on_edge,
 )
-from diffrast.edges.rim import SHORT, Rim, look_inwards
+from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
 
 _BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
 _ROUNDINGS = 8  # of a position, if that is more
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
+_PLAIN = 0.7  # a surface's plane, drawn on to its rim, is no nearer: of a sphere 0.5
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
@@ -246,16 +247,33 @@ def look(
     shown = picked(pictured, beyond_look)
     after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE))
     masks = jnp.stack([fold & before, search & after])
-    start, other_start = _seen_nearest(masks, pictured, middle, middle + _LOOK * out)
-    is_behind = picked(after, beyond_look) | (other_start < 0)
-    leave = jnp.stack([start, jnp.where(is_behind, jnp.where(search, shown, -1), other_start)])
-    leave, (x, y) = stored((leave, centre + middle + outside * out))
-    reached, there = walk(leave, x, y, faces, pixels, topology.neighbors, volume)
+    hiding, behind = _seen_nearest(masks, pictured, middle, middle + _LOOK * out)
+    shown_fits = picked(after, beyond_look) | (behind < 0)
+    behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
+
+    # And two to the point just inside, from pixels that show the surface in front, or another part
+    # of it that folds before or behind: where it is not plain that this one comes nearer inwards.
+    inwards = next_inwards(middle, -out)
+    looks = jnp.stack([front_look, inwards[1]])
+    ours = stored(jnp.stack([picked(pictured, look) for look in looks]))
+    alike = fold & (ours >= 0) & (topology.patches[jnp.maximum(ours, 0)] == front_patch)
+    x, y = pieces.pixel[:, None] + 0.5 + jnp.stack([looks % 3 - 1, looks // 3 - 1])
+    ahead = edge_values(corners_of(ours, faces, pixels), x, y)[1] - near
+    planes = jnp.stack([picked(depths, look) for look in looks]) - near
+    plain = (ours == front) | jnp.any(nearby[:, None] == ours, axis=0)
+    plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
+
+    ways = jnp.stack([hiding, behind, *jnp.where(alike & ~plain, ours, -1)])
+    away = jnp.stack([outside * out] * 2 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
+    ways, (x, y) = stored((jnp.where(visible, ways, -1), (centre + middle)[:, None] + away))
+    reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
     arrives = there & (reached >= 0)
-    reached = stored(jnp.where(arrives | (leave >= 0), reached, beyond))
+    reached = stored(jnp.where(arrives | (ways >= 0), reached, beyond))
     values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
-    hides = arrives & (reached != own[0]) & (reached != own[1])
-    hides = stored(hides & (reached_depth > near * (1 + FINE_TOLERANCE)))
+    above = stored(reached_depth > near * (1 + FINE_TOLERANCE))
+    touches = ~above[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
+    connected = alike & (plain | (arrives[2:] & (touches | (reached[2:] == front))))
+    hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & above[:2]
     visible = visible & ~jnp.any(hides, axis=0)
     lies = arrives[1] & ~hides[1]
     stops = search & there[1] & (reached[1] < 0) & (shown >= 0)
@@ -279,10 +297,8 @@ def look(
         front,
         thickness,
         pictured,
-        topology.patches,
-        front_look,
-        near,
-        depths,
+        inwards,
+        connected[0] & connected[1],
         middle,
         -out,
         centre,
@@ -291,7 +307,6 @@ def look(
         topology.neighbors,
         volume,
     )
-    rim = rim._replace(smooth=rim.smooth & fold)
 
     # A flap of a curved surface, narrower than a pixel, in front of that surface itself.
     same = picked(patch, beyond_look) == front_patch
