@@ -48,7 +48,7 @@ _BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it
 _ROUNDINGS = 8  # of a position, if that is more
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
-_PLAIN = 0.7  # a surface's plane, drawn on to its rim, is no nearer: of a sphere 0.5
+_PLAIN = 0.7  # of what comes nearer from a rim to a pixel: its plane's share, 0.5 on a sphere
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
@@ -270,10 +270,10 @@ def look(
     arrives = there & (reached >= 0)
     reached = stored(jnp.where(arrives | (ways >= 0), reached, beyond))
     values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
-    above = stored(reached_depth > near * (1 + FINE_TOLERANCE))
-    touches = ~above[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
+    in_front = reached_depth > near * (1 + FINE_TOLERANCE)
+    touches = ~in_front[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
     connected = alike & (plain | (arrives[2:] & (touches | (reached[2:] == front))))
-    hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & above[:2]
+    hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & in_front[:2]
     visible = visible & ~jnp.any(hides, axis=0)
     lies = arrives[1] & ~hides[1]
     stops = search & there[1] & (reached[1] < 0) & (shown >= 0)
