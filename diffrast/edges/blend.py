@@ -139,6 +139,11 @@ def _place(view: View, pixel: Array, look: Array | int) -> Array:
     return (pixel[1] + look // 3) * view.image.shape[1] + pixel[0] + look % 3
 
 
+def _number(view: View, pixel: Array) -> Array:
+    """Index of pixels in the image without its border."""
+    return pixel[1] * (view.image.shape[1] - 2) + pixel[0]
+
+
 def _colors(image: Array, place: Int[Array, " n"]) -> Float[Array, "channels n"]:
     """What an image shows there."""
     return image.reshape(-1, image.shape[2])[place].T
@@ -205,8 +210,7 @@ def with_pieces(
         sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
     if sums is not None and sums.unseen is not None:
         face = stored(jnp.where(found.visible & found.unseen, found.front.face, -1))
-        place = pieces.pixel[1] * (view.image.shape[1] - 2) + pieces.pixel[0]
-        sums = sums._replace(unseen=sums.unseen.at[place].max(face))
+        sums = sums._replace(unseen=sums.unseen.at[_number(view, pieces.pixel)].max(face))
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),
@@ -265,7 +269,7 @@ def _with_values(
     held: Sequence[Float[Array, "channels n"]],
 ) -> tuple[Sums | None, Int[Array, " n"]]:
     """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
-    number = stored(jnp.where(used, pixel[1] * (view.image.shape[1] - 2) + pixel[0], 0))
+    number = stored(jnp.where(used, _number(view, pixel), 0))
     if total is None:
         return None, number
     added = total.added.at[number].add(stored(jnp.where(used, value, 0)).T)

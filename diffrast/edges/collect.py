@@ -89,15 +89,18 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     # Else what it is added to would be made, and held, before the image and the first list are.
     zero = stored(zero_after(work[0].size), view.image[0, 0, 0])
 
-    def with_batches(blended: Blended, passed: Array, work: Work) -> tuple[Blended, Array]:
+    def with_batches(blended: Blended, passed: Array, part: Work) -> tuple[Blended, Array]:
+        order, size, at_once, add = part
+
         def add_batch(indices: Array, exists: Array, total: Blended) -> Blended:
-            records, sums = work.add(indices, exists, total)
+            records, sums = add(indices, exists, total)
             return Blended(records and after_batch(records), sums)
 
         first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
-        batches = work.order, work.size, work.at_once
-        blended = over_batches(*batches, add_batch, blended, first=first, goes_on=goes_on)
-        return blended, passed + batches_of(work.size, work.at_once)
+        blended = over_batches(
+            order, size, at_once, add_batch, blended, first=first, goes_on=goes_on
+        )
+        return blended, passed + batches_of(size, at_once)
 
     blended, passed = nothing(view, method, start, zero), zero
     for part in work:
@@ -175,7 +178,14 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = stored(jnp.stack([number % width, number // width]))
         crossings = cross(
-            pixel, exists, view.faces, pixels, view.topology, volume, view.face_image, unseen
+            pixel,
+            exists,
+            view.faces,
+            pixels,
+            view.topology,
+            volume,
+            view.face_image,
+            stored(unseen[number]),
         )
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:

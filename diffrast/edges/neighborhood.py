@@ -32,6 +32,11 @@ def pixel_at(
     return 4 + 3 * row + column
 
 
+def steps_to(look: Int[Array, "*n"]) -> Int[Array, "2 *n"]:
+    """Columns and rows from the middle one of the 3×3 pixels to another, 0 to 8."""
+    return jnp.stack([look % 3 - 1, look // 3 - 1])
+
+
 def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:
     """The values of the 3×3 pixels round each pixel of an image with a border, shape (9, n)."""
     nine = jnp.arange(9)[:, None]
@@ -71,6 +76,11 @@ def only(face: Array, drawn: Bool[Array, " F"]) -> Array:
     return jnp.where((face >= 0) & drawn[jnp.maximum(face, 0)], face, -1)
 
 
+def turned_alike(face: Int[Array, "*n"], facing: Array, volume: Float[Array, " F"]) -> Array:
+    """Whether there are faces that are drawn and turn the side to the eye that `facing` tells."""
+    return (face >= 0) & (volume[jnp.maximum(face, 0)] * facing > 0)
+
+
 def walk(
     face: Int[Array, "ways n"],
     x: Float[Array, "ways n"],
@@ -97,8 +107,8 @@ def walk(
             steps, face, there = state
             values = jnp.stack(edge_values(corners_of(face, faces, pixels), to_x, to_y)[0])
             beside = stored(neighbors.T[:, jnp.maximum(face, 0)])
-            goes_on = volume[jnp.maximum(beside, 0)] * facing > 0
-            aside = stored(jnp.where((beside >= 0) & goes_on, jnp.minimum(values, 0), 0))
+            goes_on = turned_alike(beside, facing, volume)
+            aside = stored(jnp.where(goes_on, jnp.minimum(values, 0), 0))
             best = (aside < 0) & (aside == jnp.min(aside, axis=0))
             following = jnp.max(jnp.where(best, beside, -1), axis=0)
             there = there | (face < 0) | jnp.all(values >= 0, axis=0)

@@ -102,11 +102,12 @@ def cross(
     topology: Topology,
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
-    unseen: Int[Array, " pixels"],
+    unseen: Int[Array, " n"],
 ) -> Crossings:
     """Find which faces near pixels (column, row) may pierce each other there, seen or not.
 
-    Those that reach into the pixel, and whose planes meet within it.
+    Those that reach into the pixel, and whose planes meet within it. `unseen` is one more face of
+    each pixel, or -1.
     """
     assert topology.bodies is not None
     face, look, body = _candidates(
@@ -148,8 +149,7 @@ def _candidates(
     )
     parents = jnp.stack([picked(face, one), picked(face, other)])
     nearby = neighbors[jnp.maximum(parents, 0)].transpose(0, 2, 1).reshape(6, -1)
-    beside = unseen[pixel[1] * (face_image.shape[1] - 2) + pixel[0]]
-    face = stored(jnp.concatenate([face, only(nearby, volume != 0), beside[None]]))
+    face = stored(jnp.concatenate([face, only(nearby, volume != 0), unseen[None]]))
     return face, look, bodies[jnp.maximum(face, 0)]
 
 

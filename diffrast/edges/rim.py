@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import picked, pixel_at
+from diffrast.edges.neighborhood import picked, pixel_at, steps_to, turned_alike
 from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
 
 BESIDE = 0.02  # pixels
@@ -44,7 +44,7 @@ def look_inwards(
     front: Int[Array, " n"],
     thickness: Float[Array, " n"],
     pictured: Int[Array, "9 n"],
-    inside: tuple[Float[Array, " n"], Int[Array, " n"]],
+    inwards: tuple[Float[Array, " n"], Int[Array, " n"]],
     connected: Bool[Array, " n"],
     middle: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
@@ -60,7 +60,7 @@ def look_inwards(
         front: face in front.
         thickness: how far it reaches.
         pictured: faces at the 3×3 pixels.
-        inside: what `next_inwards` tells.
+        inwards: what `next_inwards` tells.
         connected: whether the pixel that shows the front and the next one inwards show its surface.
         middle: of the piece, from the pixel's centre.
         inward: unit normal towards the face in front.
@@ -70,8 +70,8 @@ def look_inwards(
         neighbors: of faces.
         volume: see `look`.
     """
-    depth, inner = inside
-    step = jnp.stack([inner % 3 - 1, inner // 3 - 1])
+    depth, inner = inwards
+    step = steps_to(inner)
     next_face = stored(picked(pictured, inner))
     first = jnp.minimum(thickness, depth)
     beyond = jnp.where(thickness >= depth, front, next_face)
@@ -80,10 +80,9 @@ def look_inwards(
     covered, at = locate(corners_of(face, faces, pixels), x, y)
     bend = [jnp.clip(b[0], 0, 1) for b in at]
     # Where the face ends, a narrow one may fold again.
-    out = jnp.argmin(jnp.stack(bend), axis=0)
-    following = neighbors[jnp.maximum(front, 0), out]
-    faces_alike = volume[jnp.maximum(following, 0)] * jnp.sign(volume[jnp.maximum(front, 0)]) > 0
-    goes_on = (thickness >= depth) | ((following >= 0) & faces_alike)
+    known, out = jnp.maximum(front, 0), jnp.argmin(jnp.stack(bend), axis=0)
+    following = turned_alike(neighbors[known, out], jnp.sign(volume[known]), volume)
+    goes_on = (thickness >= depth) | following
     x, y = centre + step - BESIDE * inward
     beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])
     total = jnp.maximum(bend[0] + bend[1] + bend[2], _SMALL)

@@ -25,6 +25,7 @@ from diffrast.edges.neighborhood import (
     pixel_at,
     pixels_round,
     ring_of_edge,
+    steps_to,
     walk,
 )
 from diffrast.edges.parts import Candidates, first_part, nearest_behind
@@ -247,7 +248,8 @@ def look(
     shown = picked(pictured, beyond_look)
     after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE))
     masks = jnp.stack([fold & before, search & after])
-    hiding, behind = _seen_nearest(masks, pictured, middle, middle + _LOOK * out)
+    points = jnp.stack([middle, middle + _LOOK * out])
+    hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
     shown_fits = picked(after, beyond_look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
 
@@ -256,8 +258,9 @@ def look(
     inwards = next_inwards(middle, -out)
     looks = jnp.stack([front_look, inwards[1]])
     ours = stored(jnp.stack([picked(pictured, look) for look in looks]))
-    alike = fold & (ours >= 0) & (topology.patches[jnp.maximum(ours, 0)] == front_patch)
-    x, y = pieces.pixel[:, None] + 0.5 + jnp.stack([looks % 3 - 1, looks // 3 - 1])
+    alike = jnp.stack([picked(patch, look) for look in looks]) == front_patch
+    alike = alike & fold & (ours >= 0)
+    x, y = centre[:, None] + steps_to(looks)
     ahead = edge_values(corners_of(ours, faces, pixels), x, y)[1] - near
     planes = jnp.stack([picked(depths, look) for look in looks]) - near
     plain = (ours == front) | jnp.any(nearby[:, None] == ours, axis=0)
@@ -344,15 +347,12 @@ def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Arra
     return jnp.where(picked(same, look) | (first == 9), look, first)
 
 
-def _seen_nearest(masks: Array, pictured: Array, *points: Array) -> Array:
-    """What the pixels of the 3×3 show whose centres are nearest to points, of masks; or -1."""
-    nine = jnp.arange(9)[:, None]
-    x, y = jnp.stack(points, axis=1)[:, :, None]
-    x, y = nine % 3 - 1 - x, nine // 3 - 1 - y
-    distance = stored(jnp.where(masks, x * x + y * y, jnp.inf))
-    nearest = masks & (distance == jnp.min(distance, axis=1, keepdims=True))
-    best = jnp.min(jnp.where(nearest, nine, 9), axis=1)
-    return jnp.where(best < 9, jnp.take_along_axis(pictured, jnp.minimum(best, 8), axis=0), -1)
+def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
+    """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
+    x, y = steps_to(jnp.arange(9))[..., None] - point[:, None]
+    distance = stored(jnp.where(mask, x * x + y * y, jnp.inf))
+    best = first_row(mask & (distance == jnp.min(distance, axis=0)))
+    return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
 
 
 def _thickness(
