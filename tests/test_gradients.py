@@ -10,6 +10,7 @@ from functools import cache
 from itertools import cycle
 
 import gradient_reference as reference
+import gradient_scenes
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,7 +60,7 @@ def padded_meshes():
     """The two meshes of each of these scenes, the second of which may be nothing."""
     rows = []
     for name in ALIKE:
-        meshes = [mesh_of(thing) for thing in reference.SCENES[name]().objects]
+        meshes = [mesh_of(thing) for thing in gradient_scenes.SCENES[name]().objects]
         rows.append([*meshes, NOTHING][:2])
     both = [dr.mesh.stack_meshes(column) for column in zip(*rows, strict=True)]
     return {
@@ -166,7 +167,7 @@ def test_derivatives_are_those_of_the_box_filtered_image(name):
             assert error < BOUNDS[name][key.startswith("L2")], (key, found)
     if name in BETTER:
         times, samples = BETTER[name]
-        problem = reference.SCENES[name]()
+        problem = gradient_scenes.SCENES[name]()
         settings = settings_of(problem, antialias=False, samples=samples)
         plain = rendered(
             scene_of(problem, name), jnp.zeros(reference.parameters(problem)), settings
@@ -176,7 +177,7 @@ def test_derivatives_are_those_of_the_box_filtered_image(name):
 
 def test_derivatives_by_vertices():
     # Triangles of some five pixels, all vertices moving at random.
-    problem = replace(reference.crease(), size=48)
+    problem = replace(gradient_scenes.crease(), size=48)
     thing = problem.objects[0]
     changes = np.random.default_rng(4).normal(size=(3, *thing.vertices.shape))
     fields = reference.adjoint_fields(problem.size)
@@ -220,7 +221,7 @@ def test_derivatives_by_vertices():
     ],
 )
 def test_parallel_projection_has_the_same_edges(name, window, group, way):
-    problem = replace(reference.SCENES[name](), window=window)
+    problem = replace(gradient_scenes.SCENES[name](), window=window)
     part, step = reference.groups(problem)[group], 1e-2
 
     def truth(steps):
@@ -239,7 +240,7 @@ def test_parallel_projection_has_the_same_edges(name, window, group, way):
 
 def errors(name, **options):
     """Relative errors of the projected derivatives and of the L2 gradient, by parameter group."""
-    problem = reference.SCENES[name]()
+    problem = gradient_scenes.SCENES[name]()
     stored = reference.load(name)
     fields = np.float32(reference.adjoint_fields(problem.size))
     target = np.float32(reference.reference_image(problem, stored["target_image_params"]))
@@ -262,7 +263,7 @@ def errors(name, **options):
 
 
 def main():
-    for name in sys.argv[1:] or reference.SCENES:
+    for name in sys.argv[1:] or gradient_scenes.SCENES:
         found = errors(name)
         text = "  ".join(f"{key} {value:.4f}" for key, value in found.items())
         print(f"{name:10} {text}", flush=True)
