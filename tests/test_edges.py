@@ -114,6 +114,33 @@ def test_bodies_that_lie_in_one_another_have_no_line_in_common():
     assert np.sum(one == 0) > 200
 
 
+@pytest.mark.parametrize(("shading", "share"), [("flat", 0.5), ("phong", 1.0)])
+def test_faces_of_a_pixel_that_pierce_and_hide_one_another_are_as_exact_as_16_samples(
+    shading, share
+):
+    """Two balls that pierce one another, a ring round them, and a floor behind."""
+    red, blue = (dr.Material(diffuse=color) for color in ((0.9, 0.5, 0.4), (0.3, 0.5, 0.9)))
+    one = dr.linalg.translation((-0.5, 0, 0)) @ dr.linalg.scaling(0.8)
+    other = dr.linalg.translation((0.5, 0.2, 0.3)) @ dr.linalg.scaling(0.6)
+    lying = dr.linalg.translation((0, -0.6, 0)) @ dr.linalg.rotation_x(-np.pi / 2)
+    objects = [
+        dr.Object(dr.shapes.icosphere(4), red, one),
+        dr.Object(dr.shapes.icosphere(4), red, other),
+        dr.Object(dr.shapes.torus(1.2, 0.12, major_segments=64, minor_segments=16), blue),
+        dr.Object(dr.shapes.plane(8.0, 8.0), None, lying),
+    ]
+    sun = dr.DirectionalLight(direction=(-0.8, -1, -0.5), diffuse=(0.8,) * 3, ambient=(0.1,) * 3)
+    scene = dr.Scene(objects=objects, lights=[sun])
+    view = dr.Camera.perspective(eye=(1, 1.5, 4), target=(0, 0, 0), fov_y=0.7, near=0.1, far=50.0)
+
+    def drawn(**options):
+        settings = dr.RenderSettings(height=80, width=80, shading=shading, **options)
+        return np.float64(jax.jit(dr.render)(scene, view, settings))
+
+    many, some = (drawn(antialias=False, samples=samples) for samples in (256, 16))
+    assert abs(drawn() - many).mean() < share * abs(some - many).mean()
+
+
 def test_what_thin_faces_hide_shows_no_edge():
     """The faces in front are so thin that the pixels beside the edge may see none of them."""
     wall = dr.shapes.plane(8.0, 8.0, divisions=(2, 130))

@@ -3,9 +3,12 @@
 The 1/w of a plane is linear on the screen, and so is the difference of that of two faces: where it
 is zero they meet, along a straight line, with the one in front on this side and the other on that.
 The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
-faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, those next to
-one of each of two bodies, and one of which an edge is visible in the pixel, but nothing at any of
-these centres. A surface that pierces itself is not found.
+faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, one of which an
+edge is visible in the pixel, but nothing at any of these centres, and the faces of two bodies that
+meet nearest to the centre, with those next to them. These two are found by walks over both surfaces
+to where the planes meet that are known so far. Faces smaller than a pixel are too many to be cut
+with one another: the planes of these two stand for their surfaces in all of the pixel. A surface
+that pierces itself is not found.
 
 With homogeneous corners V, a point p of the screen (x, y, 1) is the sum of λ V, the λ linear in p
 and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, and c · V = 1 at each
@@ -17,31 +20,43 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
 from diffrast._stored import stored
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import first_row, only, picked, pixels_round
+from diffrast.edges.neighborhood import first_row, only, picked, pixels_round, steps_to, walk
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import TOLERANCE, Table, corners_of
+from diffrast.edges.planes import TOLERANCE, Table, area, corners_of
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 128
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _THROUGH = 0.01  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
-_FACES = 9 + 2 * 3 + 1
+_FINE = 2.0  # square pixels: faces of half this area count as small ones
+_WALKS = 4  # one after the other
+_NEAR = 1.5  # pixels from the centre to where the planes meet that are known at first
+_CLOSE = 0.1  # pixels from where two walks ended to where the planes found there meet
+_ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
+_FACES = 2 + 9 + 2 * 3 + 1
+_CENTRE = 2  # the row of what the pixel's centre shows
 
 
 class _Planes(NamedTuple):
-    """Faces that may be seen at each pixel, shape (16, n); from the pixel's centre."""
+    """Faces that may be seen at each pixel, shape (18, n); from the pixel's centre."""
 
     face: Array
+    body: Array
     look: Array  # 0 to 8: pixel of the 3×3 whose colour changes as this face's
-    lambdas: Array  # (3, 3 corners, 16, n): at the centre in units of the largest sum, slopes
+    lambdas: Array  # (3, 3 corners, 18, n): at the centre in units of the largest sum, slopes
     known: Array  # neither edge-on nor there already
+    fine: Array  # smaller than a pixel
+
+
+# Walks done; two faces; whether they are looked for, each arrived, and they meet; and where.
+_Search = tuple[Array, Array, Array, Array, Array, Array]
 
 
 class Crossings(NamedTuple):
@@ -85,14 +100,6 @@ def choose_pixels(
     return selected((largest > least).reshape(-1) | (unseen >= 0))
 
 
-def _two_bodies(body: Array) -> tuple[Array, Array]:
-    """Rows of the first one that is there, and of the first other."""
-    last = body.shape[0] - 1
-    one = jnp.minimum(first_row(body >= 0), last)
-    differs = (body >= 0) & (body != picked(body, one))
-    return one, jnp.minimum(first_row(differs), last)
-
-
 @jax.jit
 def cross(
     pixel: Int[Array, "2 n"],
@@ -109,73 +116,144 @@ def cross(
     Those that reach into the pixel, and whose planes meet within it. `unseen` is one more face of
     each pixel, or -1.
     """
-    assert topology.bodies is not None
-    face, look, body = _candidates(
-        pixel, topology.bodies, topology.neighbors, volume, face_image, unseen
+    planes, unit, met = _candidates(
+        pixel, exists, faces, pixels, topology, volume, face_image, unseen
     )
-    planes, unit = _planes(pixel, face, look, faces, pixels)
     value, *slopes = planes.lambdas
     reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
     near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
-    body = stored(jnp.where(near, body, -1))
+    body = stored(jnp.where(near, planes.body, -1))
     value, across, down = (part[:, None] - part for part in stored(jnp.sum(planes.lambdas, axis=1)))
     meet = abs(value) <= 0.5 * (abs(across) + abs(down))
     differ = (body[:, None] != body) & (body[:, None] >= 0) & (body >= 0)
+    # Of small faces only the two that were found to meet.
+    coarse = stored(~planes.fine)
+    wanted = (coarse[:, None] & coarse).at[0, 1].set(coarse[0] & coarse[1] | met)
     once = np.tri(_FACES, k=-1, dtype=bool).T[..., None]
-    return Crossings(pixel, planes, unit, *selected((once & differ & meet).reshape(-1)))
+    return Crossings(pixel, planes, unit, *selected((once & differ & meet & wanted).reshape(-1)))
 
 
 def _candidates(
     pixel: Array,
-    bodies: Array,
-    neighbors: Array,
+    exists: Array,
+    faces: Array,
+    pixels: Table,
+    topology: Topology,
     volume: Array,
     face_image: Array,
     unseen: Array,
-) -> tuple[Array, Array, Array]:
-    """Faces, the pixels of the 3×3 where they or faces next to them are seen, and their bodies."""
+) -> tuple[_Planes, Array, Array]:
+    """Faces at pixels, the unit of their 1/w, and whether those in rows 0 and 1 meet."""
+    assert topology.bodies is not None
     pictured = stored(pixels_round(face_image, *pixel))
     nearest_first = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
     face = pictured[nearest_first]
-    body = jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1)
-    one, other = _two_bodies(body)
-    seen = jnp.stack([one, other])
-    look = jnp.concatenate(
-        [
-            jnp.broadcast_to(nearest_first[:, None], face.shape),
-            jnp.repeat(jnp.asarray(nearest_first)[seen], 3, axis=0),
-            jnp.full_like(face[:1], 4),
-        ]
+    body = jnp.where(face >= 0, topology.bodies[jnp.maximum(face, 0)], -1)
+    of_seen = _lambdas(pixel, face, faces, pixels)
+    rows = stored(jnp.stack(_two_bodies(body, jnp.sum(of_seen[0], axis=1))))
+    pair = jnp.stack([picked(face, row) for row in rows])
+    differ = picked(body, rows[0]) != picked(body, rows[1])
+    at = jnp.asarray(nearest_first)[rows]
+    pair, met = _meeting(pixel, pair, at, exists & differ, faces, pixels, topology, volume)
+    nearby = topology.neighbors[jnp.maximum(pair, 0)].transpose(0, 2, 1).reshape(6, -1)
+    others = jnp.concatenate([pair, only(nearby, volume != 0), unseen[None]])
+    of_others = _lambdas(pixel, others, faces, pixels)
+
+    def joined(other: Array, seen: Array) -> Array:
+        return jnp.concatenate([other[..., :2, :], seen, other[..., 2:, :]], axis=-2)
+
+    look = jnp.concatenate([at, jnp.repeat(at, 3, axis=0), jnp.full_like(unseen[None], 4)])
+    look = joined(look, jnp.broadcast_to(nearest_first[:, None], face.shape))
+    face, lambdas, volume, size = map(joined, (others, *of_others), (face, *of_seen))
+    again = jnp.any(
+        face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
     )
-    parents = jnp.stack([picked(face, one), picked(face, other)])
-    nearby = neighbors[jnp.maximum(parents, 0)].transpose(0, 2, 1).reshape(6, -1)
-    face = stored(jnp.concatenate([face, only(nearby, volume != 0), unseen[None]]))
-    return face, look, bodies[jnp.maximum(face, 0)]
+    known = (face >= 0) & (volume != 0) & jnp.isfinite(volume) & ~again
+    total = jnp.sum(lambdas[0], axis=0)
+    largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
+    unit = stored(1 / jnp.where(largest > 0, largest, 1))
+    body = topology.bodies[jnp.maximum(face, 0)]
+    face, lambdas, fine = stored((face, lambdas * unit, size < _FINE))
+    return _Planes(face, body, look, lambdas, known, fine), unit, met
 
 
-def _planes(
-    pixel: Array, face: Array, look: Array, faces: Array, pixels: Table
-) -> tuple[_Planes, Array]:
-    x, y, w = corners_of(face, faces, pixels)
+def _two_bodies(body: Array, planes: Array) -> tuple[Array, Array]:
+    """Rows of the first body that is there, and of the other whose plane meets its plane nearest.
+
+    Args:
+        body: (rows, n), -1 where there is none.
+        planes: (3, rows, n), 1/w at the pixel's centre and its slopes.
+    """
+    last = body.shape[0] - 1
+    one = jnp.minimum(first_row(body >= 0), last)
+    value, across, down = (part - picked(part, one) for part in planes)
+    differs = (body >= 0) & (body != picked(body, one))
+    steepness = jnp.hypot(across, down)
+    distance = abs(value) / jnp.where(steepness > 0, steepness, 1)
+    never = jnp.finfo(distance.dtype).max
+    distance = jnp.where((steepness > 0) & (distance < never), distance, never)
+    distance = stored(jnp.where(differs, distance, jnp.inf))
+    return one, jnp.minimum(first_row(differs & (distance == jnp.min(distance, axis=0))), last)
+
+
+def _meeting(
+    pixel: Array,
+    pair: Array,
+    look: Array,
+    exists: Array,
+    faces: Array,
+    pixels: Table,
+    topology: Topology,
+    volume: Array,
+) -> tuple[Array, Array]:
+    """Two faces where the surfaces of two others meet next to the pixel's centre; if they do."""
+    centre = (pixel + 0.5)[:, None]
+    from_centre = steps_to(look)
+
+    def meet(pair: Array) -> Array:
+        planes = jnp.sum(_lambdas(pixel, pair, faces, pixels)[0], axis=1)
+        return stored(_line(planes[:, 0] - planes[:, 1])[0])
+
+    def step(state: _Search) -> _Search:
+        n, pair, searched, arrived, met, point = state
+        point = jnp.clip(point, -0.5, 0.5)
+        # Half-way where it is too far: the surface may turn away before.
+        to = jnp.where(arrived, point[:, None], (point[:, None] + from_centre) / 2)
+        x, y = stored(centre + to)
+        ways = jnp.where(searched, pair, -1)
+        reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
+        now = there & (reached >= 0)
+        pair = stored(jnp.where(now, reached, pair))
+        following = meet(pair)
+        close = jnp.sum((following - point) ** 2, axis=0) < _CLOSE**2
+        met = met | (searched & jnp.all(arrived & now, axis=0) & close)
+        pair, searched, now, met, following = stored((pair, searched & ~met, now, met, following))
+        return n + 1, pair, searched, now, met, following
+
+    def is_left(state: _Search) -> Array:
+        return (state[0] < _WALKS) & jnp.any(state[2])
+
+    point = meet(pair)
+    goes_on = jnp.any(topology.neighbors[jnp.maximum(pair, 0)] >= 0, axis=(0, 2))
+    searched = exists & goes_on & (jnp.max(abs(point), axis=0) < _NEAR)
+    start = pixel[0, 0] & 0, pair, searched, pair >= -1, pair[0] < -1, point
+    _, pair, _, _, met, _ = lax.while_loop(is_left, step, start)
+    return pair, met
+
+
+def _lambdas(pixel: Array, face: Array, faces: Array, pixels: Table) -> tuple[Array, Array, Array]:
+    """λ of faces at the pixel's centre and its slopes, (3, 3 corners, ...); the volume; areas."""
+    x, y, w = corners = corners_of(face, faces, pixels)
     centre = pixel + 0.5
     u, v = stored((x - centre[0] * w, y - centre[1] * w))
     turns = [(1, 2), (2, 0), (0, 1)]
     values = [u[i] * v[j] - u[j] * v[i] for i, j in turns]
     volume = values[0] * w[0] + values[1] * w[1] + values[2] * w[2]
     inverse = stored(1 / jnp.where(volume == 0, 1, volume))
-    again = jnp.any(
-        face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
-    )
-    known = (face >= 0) & (volume != 0) & jnp.isfinite(volume) & ~again
-    total = (values[0] + values[1] + values[2]) * inverse
-    largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
-    unit = stored(1 / jnp.where(largest > 0, largest, 1))
-    scale = inverse * unit
-    at_centre = jnp.stack(values) * scale
-    across = jnp.stack([w[j] * v[i] - w[i] * v[j] for i, j in turns]) * scale
-    down = jnp.stack([u[j] * w[i] - u[i] * w[j] for i, j in turns]) * scale
-    lambdas = stored(jnp.stack([at_centre, across, down]))
-    return _Planes(face=face, look=look, lambdas=lambdas, known=known), unit
+    at_centre = jnp.stack(values)
+    across = jnp.stack([w[j] * v[i] - w[i] * v[j] for i, j in turns])
+    down = jnp.stack([u[j] * w[i] - u[i] * w[j] for i, j in turns])
+    return jnp.stack([at_centre, across, down]) * inverse, volume, area(corners)
 
 
 def _line(difference: Array) -> tuple[Array, Array, Array]:
@@ -209,16 +287,19 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     def both(values: Array) -> Array:
         return stored(jnp.stack([picked(values, one), picked(values, other)]))
 
+    # Small faces stand for their surfaces, also beside them.
+    whole = both(planes.fine)
     which = jnp.stack([one, other])[None, None]
     at = jnp.take_along_axis(planes.lambdas, which, axis=2, mode="promise_in_bounds")
     at = stored(at)  # (3, 3 corners, 2 faces, n)
     sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
     point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))
+    point = _kept_aside(point, normal, whole, both(planes.body), planes)
     along = _left_of(normal)
 
     def inside(x: Array, y: Array) -> Array:
         square = jnp.stack([0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y])
-        on_faces = at[0] + x * at[1] + y * at[2]
+        on_faces = jnp.where(whole, 1, at[0] + x * at[1] + y * at[2])
         return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
 
     low, high = positive_part(*(list(inside(*(point + r * along))) for r in (-_REACH, _REACH)))
@@ -230,15 +311,17 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
 
     # Both reach to both sides.
     aside = _THROUGH * (at[1] * normal[0] + at[2] * normal[1])
-    through = jnp.min(values - abs(aside), axis=(0, 1)) > 0
+    through = jnp.min(jnp.where(whole, 1, values - abs(aside)), axis=(0, 1)) > 0
     # Faces that lie on one another differ by rounding, and have no line.
     largest = jnp.max(abs(at), axis=(0, 1))
     rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[0] + largest[1])
     used = exists & (inverse * rounding < 1) & (low < high) & through
-    used = used & ~_hidden(planes, x, y, depth[0])
+    own = jnp.any(whole[:, None] & (planes.body == both(planes.body)[:, None]), axis=0)
+    used = used & ~_hidden(planes, ~own, x, y, depth[0])
 
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
     in_front = values + aside * jnp.array([[1], [-1]])
+    in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
     total = jnp.sum(in_front, axis=0)
 
     centre = pixel + 0.5
@@ -260,8 +343,20 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     )
 
 
-def _hidden(planes: _Planes, x: Array, y: Array, depth: Array) -> Array:
-    """Whether one of the faces is before the point (x, y), whose 1/w is `depth`."""
+def _kept_aside(point: Array, normal: Array, whole: Array, body: Array, planes: _Planes) -> Array:
+    """A line's point, moved past the pixel's centre if that shows the body on its other side.
+
+    Of small faces, whose planes are not quite their surfaces.
+    """
+    at_centre = planes.body[_CENTRE]
+    to_front = -(point[0] * normal[0] + point[1] * normal[1])  # of the first face, as at the centre
+    shown = jnp.where(at_centre == body[0], 1, jnp.where(at_centre == body[1], -1, 0))
+    moves = jnp.any(whole, axis=0) & (planes.face[_CENTRE] >= 0) & (shown * to_front < 0)
+    return stored(jnp.where(moves, -shown * _ASIDE * normal, point))
+
+
+def _hidden(planes: _Planes, others: Array, x: Array, y: Array, depth: Array) -> Array:
+    """Whether one of these faces is before the point (x, y), whose 1/w is `depth`."""
     values = planes.lambdas[0] + x * planes.lambdas[1] + y * planes.lambdas[2]
-    covers = jnp.all(values >= 0, axis=0) & planes.known
+    covers = jnp.all(values >= 0, axis=0) & planes.known & others
     return jnp.any(covers & (jnp.sum(values, axis=0) > depth * (1 + TOLERANCE)), axis=0)

@@ -239,19 +239,27 @@ def look(
     above = tiny & before
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
-    # Two walks over the surface to the point just beyond: from where a surface is seen that would
-    # hide the piece if it reached it; and where nothing is found behind, from what is seen beyond
-    # or, if that does not lie behind, from the nearest one that does. If its surface ends before,
-    # and there are empty pixels not far away, the background is bare.
-    search = fold & ~found
+    # Walks over the surface to the point just beyond: from where a surface is seen that would hide
+    # the piece if it reached it; and where nothing is found behind, or one is seen that would lie
+    # before that, from what is seen beyond or, if that does not fit, from the nearest one that
+    # does. If its surface ends before, nothing else was found, and there are empty pixels not far
+    # away, the background is bare. What hides an edge that is no fold is mostly the other side of
+    # its own body, so its second walk starts from what is seen last before it.
+    least = stored(jnp.where(found, nearest * (1 + FINE_TOLERANCE), -jnp.inf))
+    after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE)) & (depths > least)
+    search = fold & (~found | jnp.any(after, axis=0))
+    crease = ~fold & ~jnp.any((pictured == own[0]) | (pictured == own[1]), axis=0)
     bare = pictured < 0
     shown = picked(pictured, beyond_look)
-    after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE))
-    masks = jnp.stack([fold & before, search & after])
+    masks = jnp.stack([(fold | crease) & before, search & after])
     points = jnp.stack([middle, middle + _LOOK * out])
     hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
+    depth_before = stored(jnp.where(crease & before, depths, jnp.inf))
+    last = first_row((depth_before < jnp.inf) & (depth_before == jnp.min(depth_before, axis=0)))
+    last = jnp.where(last < 9, picked(pictured, jnp.minimum(last, 8)), -1)
     shown_fits = picked(after, beyond_look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
+    behind = jnp.where(crease, last, behind)
 
     # And two to the point just inside, from pixels that show the surface in front, or another part
     # of it that folds before or behind: where it is not plain that this one comes nearer inwards.
@@ -270,19 +278,18 @@ def look(
     away = jnp.stack([outside * out] * 2 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
     ways, (x, y) = stored((jnp.where(visible, ways, -1), (centre + middle)[:, None] + away))
     reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
-    arrives = there & (reached >= 0)
-    reached = stored(jnp.where(arrives | (ways >= 0), reached, beyond))
-    values, reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)
+    arrives = stored(there & (reached >= 0))
+    reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
     in_front = reached_depth > near * (1 + FINE_TOLERANCE)
     touches = ~in_front[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
     connected = alike & (plain | (arrives[2:] & (touches | (reached[2:] == front))))
     hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & in_front[:2]
     visible = visible & ~jnp.any(hides, axis=0)
-    lies = arrives[1] & ~hides[1]
-    stops = search & there[1] & (reached[1] < 0) & (shown >= 0)
+    lies = search & arrives[1] & ~hides[1] & (reached_depth[1] > least)
+    stops = search & ~found & there[1] & (reached[1] < 0) & (shown >= 0)
     gap = stops & is_bare_near(bare_blocks, *pieces.pixel)
-    at_beyond = barycentrics([value[1] for value in values])
     beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached[1], beyond)))
+    at_beyond = barycentrics(edge_values(corners_of(beyond, faces, pixels), x[1], y[1])[0])
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
