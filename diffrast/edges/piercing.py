@@ -91,13 +91,18 @@ def choose_pixels(
 
     Also of those that show a face, `unseen`, only beside their centres; -1 where there is none.
     """
-    body = jnp.where(face_image >= 0, bodies[jnp.maximum(face_image, 0)], -1)
+    body = _body_of(face_image, bodies)
     largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
     largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
     largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
     least = jnp.minimum(jnp.minimum(least[:-2], least[1:-1]), least[2:])
     least = jnp.minimum(jnp.minimum(least[:, :-2], least[:, 1:-1]), least[:, 2:])
     return selected((largest > least).reshape(-1) | (unseen >= 0))
+
+
+def _body_of(face: Array, bodies: Array) -> Array:
+    """The bodies of faces, -1 where there is none."""
+    return jnp.where(face >= 0, bodies[jnp.maximum(face, 0)], -1)
 
 
 @jax.jit
@@ -148,13 +153,15 @@ def _candidates(
     pictured = stored(pixels_round(face_image, *pixel))
     nearest_first = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
     face = pictured[nearest_first]
-    body = jnp.where(face >= 0, topology.bodies[jnp.maximum(face, 0)], -1)
+    body = _body_of(face, topology.bodies)
     of_seen = _lambdas(pixel, face, faces, pixels)
-    rows = stored(jnp.stack(_two_bodies(body, jnp.sum(of_seen[0], axis=1))))
+    seen_planes = stored(jnp.sum(of_seen[0], axis=1))
+    rows = stored(jnp.stack(_two_bodies(body, seen_planes)))
     pair = jnp.stack([picked(face, row) for row in rows])
     differ = picked(body, rows[0]) != picked(body, rows[1])
     at = jnp.asarray(nearest_first)[rows]
-    pair, met = _meeting(pixel, pair, at, exists & differ, faces, pixels, topology, volume)
+    of_pair = jnp.take_along_axis(seen_planes, rows[None], axis=1, mode="promise_in_bounds")
+    pair, met = _meeting(pixel, pair, of_pair, at, exists & differ, faces, pixels, topology, volume)
     nearby = topology.neighbors[jnp.maximum(pair, 0)].transpose(0, 2, 1).reshape(6, -1)
     others = jnp.concatenate([pair, only(nearby, volume != 0), unseen[None]])
     of_others = _lambdas(pixel, others, faces, pixels)
@@ -164,6 +171,7 @@ def _candidates(
 
     look = jnp.concatenate([at, jnp.repeat(at, 3, axis=0), jnp.full_like(unseen[None], 4)])
     look = joined(look, jnp.broadcast_to(nearest_first[:, None], face.shape))
+    body = joined(_body_of(others, topology.bodies), body)
     face, lambdas, volume, size = map(joined, (others, *of_others), (face, *of_seen))
     again = jnp.any(
         face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
@@ -172,7 +180,6 @@ def _candidates(
     total = jnp.sum(lambdas[0], axis=0)
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
-    body = topology.bodies[jnp.maximum(face, 0)]
     face, lambdas, fine = stored((face, lambdas * unit, size < _FINE))
     return _Planes(face, body, look, lambdas, known, fine), unit, met
 
@@ -199,6 +206,7 @@ def _two_bodies(body: Array, planes: Array) -> tuple[Array, Array]:
 def _meeting(
     pixel: Array,
     pair: Array,
+    planes: Array,
     look: Array,
     exists: Array,
     faces: Array,
@@ -206,12 +214,14 @@ def _meeting(
     topology: Topology,
     volume: Array,
 ) -> tuple[Array, Array]:
-    """Two faces where the surfaces of two others meet next to the pixel's centre; if they do."""
+    """Two faces where the surfaces of two others meet next to the pixel's centre; if they do.
+
+    `planes` (3, 2, n) are those of `pair`, as in `_two_bodies`, and `look` is where it is seen.
+    """
     centre = (pixel + 0.5)[:, None]
     from_centre = steps_to(look)
 
-    def meet(pair: Array) -> Array:
-        planes = jnp.sum(_lambdas(pixel, pair, faces, pixels)[0], axis=1)
+    def meet(planes: Array) -> Array:
         return stored(_line(planes[:, 0] - planes[:, 1])[0])
 
     def step(state: _Search) -> _Search:
@@ -223,17 +233,19 @@ def _meeting(
         ways = jnp.where(searched, pair, -1)
         reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
         now = there & (reached >= 0)
-        pair = stored(jnp.where(now, reached, pair))
-        following = meet(pair)
+        reached = stored(jnp.where(now, reached, pair))
+        following = meet(jnp.sum(_lambdas(pixel, reached, faces, pixels)[0], axis=1))
         close = jnp.sum((following - point) ** 2, axis=0) < _CLOSE**2
         met = met | (searched & jnp.all(arrived & now, axis=0) & close)
-        pair, searched, now, met, following = stored((pair, searched & ~met, now, met, following))
-        return n + 1, pair, searched, now, met, following
+        # Else the next walks would be these again.
+        changes = jnp.any((reached != pair) | (now != arrived), axis=0)
+        searched = searched & ~met & changes
+        return n + 1, *stored((reached, searched, now, met, following))
 
     def is_left(state: _Search) -> Array:
         return (state[0] < _WALKS) & jnp.any(state[2])
 
-    point = meet(pair)
+    point = meet(planes)
     goes_on = jnp.any(topology.neighbors[jnp.maximum(pair, 0)] >= 0, axis=(0, 2))
     searched = exists & goes_on & (jnp.max(abs(point), axis=0) < _NEAR)
     start = pixel[0, 0] & 0, pair, searched, pair >= -1, pair[0] < -1, point
@@ -288,13 +300,13 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
         return stored(jnp.stack([picked(values, one), picked(values, other)]))
 
     # Small faces stand for their surfaces, also beside them.
-    whole = both(planes.fine)
+    whole, bodies = both(planes.fine), both(planes.body)
     which = jnp.stack([one, other])[None, None]
     at = jnp.take_along_axis(planes.lambdas, which, axis=2, mode="promise_in_bounds")
     at = stored(at)  # (3, 3 corners, 2 faces, n)
     sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
     point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))
-    point = _kept_aside(point, normal, whole, both(planes.body), planes)
+    point = _kept_aside(point, normal, whole, bodies, planes.body[_CENTRE])
     along = _left_of(normal)
 
     def inside(x: Array, y: Array) -> Array:
@@ -316,7 +328,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     largest = jnp.max(abs(at), axis=(0, 1))
     rounding = _ROUNDINGS * jnp.finfo(largest.dtype).eps * (largest[0] + largest[1])
     used = exists & (inverse * rounding < 1) & (low < high) & through
-    own = jnp.any(whole[:, None] & (planes.body == both(planes.body)[:, None]), axis=0)
+    own = jnp.any(whole[:, None] & (planes.body == bodies[:, None]), axis=0)
     used = used & ~_hidden(planes, ~own, x, y, depth[0])
 
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
@@ -343,15 +355,16 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     )
 
 
-def _kept_aside(point: Array, normal: Array, whole: Array, body: Array, planes: _Planes) -> Array:
+def _kept_aside(
+    point: Array, normal: Array, whole: Array, bodies: Array, at_centre: Array
+) -> Array:
     """A line's point, moved past the pixel's centre if that shows the body on its other side.
 
     Of small faces, whose planes are not quite their surfaces.
     """
-    at_centre = planes.body[_CENTRE]
     to_front = -(point[0] * normal[0] + point[1] * normal[1])  # of the first face, as at the centre
-    shown = jnp.where(at_centre == body[0], 1, jnp.where(at_centre == body[1], -1, 0))
-    moves = jnp.any(whole, axis=0) & (planes.face[_CENTRE] >= 0) & (shown * to_front < 0)
+    shown = jnp.where(at_centre == bodies[0], 1, jnp.where(at_centre == bodies[1], -1, 0))
+    moves = jnp.any(whole, axis=0) & (shown * to_front < 0)
     return stored(jnp.where(moves, -shown * _ASIDE * normal, point))
 
 

@@ -254,9 +254,7 @@ def look(
     masks = jnp.stack([(fold | crease) & before, search & after])
     points = jnp.stack([middle, middle + _LOOK * out])
     hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
-    depth_before = stored(jnp.where(crease & before, depths, jnp.inf))
-    last = first_row((depth_before < jnp.inf) & (depth_before == jnp.min(depth_before, axis=0)))
-    last = jnp.where(last < 9, picked(pictured, jnp.minimum(last, 8)), -1)
+    last = _seen_least(crease & before, pictured, depths)
     shown_fits = picked(after, beyond_look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
     behind = jnp.where(crease, last, behind)
@@ -357,8 +355,13 @@ def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Arra
 def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
     """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
     x, y = steps_to(jnp.arange(9))[..., None] - point[:, None]
-    distance = stored(jnp.where(mask, x * x + y * y, jnp.inf))
-    best = first_row(mask & (distance == jnp.min(distance, axis=0)))
+    return _seen_least(mask, pictured, x * x + y * y)
+
+
+def _seen_least(mask: Array, pictured: Array, values: Array) -> Array:
+    """What the pixel of the 3×3 shows where a value is least, of a mask; or -1."""
+    values = stored(jnp.where(mask, values, jnp.inf))
+    best = first_row(mask & (values == jnp.min(values, axis=0)))
     return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
 
 
