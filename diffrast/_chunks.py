@@ -19,12 +19,14 @@ from jax.sharding import Mesh as DeviceMesh
 from jax.sharding import NamedSharding, PartitionSpec
 
 from diffrast._check import strongly_typed
+from diffrast._device import draws_on_cpu
 from diffrast._stored import stored
 
 AXIS = "views"
 LEAST = 2  # of one view XLA would compile other arithmetic
 _CHUNK = 16
 _CHUNK_BYTES = 1 << 24
+_OFF_CPU = 8  # times as many
 
 ViewFunction = Callable[[Any, Any], Any]
 Kinds = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of arrays
@@ -49,7 +51,8 @@ def _room(function: ViewFunction, structure: Any, kinds: Kinds) -> int:
     view = one_of(views)
     leaves = jax.tree.leaves((view, jax.eval_shape(function, shared, view)))
     size = sum(x.size * x.dtype.itemsize for x in leaves)
-    return int(np.clip(_CHUNK_BYTES // max(size, 1), 1, _CHUNK))
+    times = 1 if draws_on_cpu() else _OFF_CPU
+    return int(np.clip(times * _CHUNK_BYTES // max(size, 1), 1, times * _CHUNK))
 
 
 def kept(result: Any) -> Any:
@@ -69,7 +72,12 @@ def device_mesh(devices: tuple[jax.Device, ...]) -> DeviceMesh:
 
 
 def some_views(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
-    """Results of the first `number` of some views; zeros for the others."""
+    """Results of the first `number` of some views; of the others, whatever comes.
+
+    One after another on a CPU, else all at once.
+    """
+    if not draws_on_cpu():
+        return jax.vmap(function, (None, 0))(shared, views)
     one = jax.eval_shape(function, shared, one_of(views))
     size = jax.tree.leaves(views)[0].shape[0]
 
@@ -83,6 +91,14 @@ def some_views(function: ViewFunction, shared: Any, views: Any, number: Array) -
 
 def block_sum(function: ViewFunction, shared: Any, views: Any, number: Array) -> Any:
     """Sum of results of the first `number` of some views, with a leading axis of one."""
+    if not draws_on_cpu():
+
+        def first_ones(x: Array) -> Array:
+            exists = jnp.arange(x.shape[0]) < number
+            return jnp.where(exists.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
+
+        results = some_views(function, shared, views, number)
+        return jax.tree.map(lambda x: jnp.sum(first_ones(x), axis=0, keepdims=True), results)
     one = jax.eval_shape(function, shared, one_of(views))
 
     def step(i: Array, total: Any) -> Any:
@@ -191,6 +207,6 @@ def joined(parts: Sequence[Any]) -> Any:
 
 def cores() -> int:
     """Cores that this process may use, 1 where another device draws."""
-    if jax.default_backend() != "cpu":
+    if not draws_on_cpu():
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
+from diffrast._device import draws_on_cpu
 from diffrast._stored import stored, zero_after
 
 S = TypeVar("S")
@@ -54,8 +55,10 @@ def compacted(
 def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, ""]]:
     """Indices of what is true, ascending, and how many; the list is a little longer than the mask.
 
-    Blocks in which something is true are found first, and only these are looked through.
+    On a CPU blocks in which something is true are found first, and only these are looked through.
     """
+    if not draws_on_cpu():
+        return compacted(mask, jnp.arange(mask.size, dtype=jnp.int32))
     count = -(-mask.size // _BLOCK)
     blocks = stored(
         jnp.pad(mask, (0, count * _BLOCK - mask.size)).reshape(count, _BLOCK).astype(jnp.int8)

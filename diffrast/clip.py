@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast import _check
@@ -84,6 +84,11 @@ def clip_triangles(
     return ClippedPolygons(corners[..., :4], corners[..., 4:], jnp.where(count >= 3, count, 0))
 
 
+def _side(points: Array, plane: Array) -> Array:
+    """Distances from a plane; with all digits, of which other devices would leave some out."""
+    return jnp.matmul(points, plane, precision=lax.Precision.HIGHEST)
+
+
 @jax.jit
 def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     """Polygons (F, n, values), of which `count` corners are used, with one more corner."""
@@ -92,7 +97,7 @@ def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     used = slot < count[:, None]
     following = jnp.where(slot + 1 < count[:, None], slot + 1, 0)
     after = jnp.take_along_axis(corners, following[..., None], axis=1)
-    here_side, after_side = corners[..., :4] @ plane, after[..., :4] @ plane
+    here_side, after_side = _side(corners[..., :4], plane), _side(after[..., :4], plane)
     here_in, after_in = here_side >= 0, after_side >= 0
     inner = jnp.where(here_in[..., None], corners, after)
     outer = jnp.where(here_in[..., None], after, corners)
@@ -139,7 +144,7 @@ def clip_lines(
     low, high = jnp.zeros_like(first[:, 0]), jnp.ones_like(first[:, 0])
     seen = jnp.ones_like(low, dtype=bool)
     for plane in planes:
-        at_first, at_second = first @ plane, second @ plane
+        at_first, at_second = _side(first, plane), _side(second, plane)
         leaves, enters = (at_first >= 0) & (at_second < 0), (at_first < 0) & (at_second >= 0)
         crosses = leaves | enters
         crossing = jnp.where(crosses, at_first, 0) / jnp.where(crosses, at_first - at_second, 1)

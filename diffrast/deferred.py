@@ -17,6 +17,7 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Int
 
+from diffrast._device import draws_on_cpu
 from diffrast._selection import compacted
 from diffrast._stored import stored, zero_after
 from diffrast._varying import varying_alike, varying_zero
@@ -108,7 +109,7 @@ def shade_covered(
 
 def comes_held(face: Array, in_batches: bool) -> bool:
     """Whether the colours of `shade_covered` come out of a condition: each in a buffer."""
-    return in_batches and face.size > LARGE
+    return in_batches and face.size > LARGE and draws_on_cpu()
 
 
 def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:

@@ -177,7 +177,7 @@ def _camera(file: SceneFile, objects: list[Object]) -> Camera:
     axes = viewing.view_axes([-x for x in file.view_plane_normal], file.view_up)
     origin = float_array("view_reference_point", file.view_reference_point, (3,))
     depths = [
-        (linalg.transform_points(item.transform, item.mesh.vertices) - origin) @ axes[2]
+        jnp.sum((linalg.transform_points(item.transform, item.mesh.vertices) - origin) * axes[2], 1)
         for item in objects
     ]
     distance = file.projection_distance

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,10 +13,11 @@ from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
+from diffrast._device import lanes, over_views
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
 from diffrast.edges.collect import collect
-from diffrast.edges.derivative import apply_linear, linear_zeros
+from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear, linear_zeros
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
 
@@ -144,8 +146,8 @@ def antialias_image(
         cull_backfaces: whether only front faces are drawn.
     """
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
-    capacity = max(4096, 1024 * math.ceil(height * width / 8 / 1024))
-    method = Method(shader, glow, cull_backfaces, capacity)
+    capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 8 / ROWS_AT_ONCE))
+    method = Method(shader, glow, cull_backfaces, capacity, lanes())
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
     if view.topology.bodies is None and view.cast is None:
@@ -159,7 +161,10 @@ def antialias_image(
     view = view._replace(positions_clip=positions_clip, scale=scale)
 
     def gather(view: View, method: Method) -> Blended:
-        return jax.custom_batching.sequential_vmap(lambda view: collect(view, method))(view)
+        def in_lanes(lanes: int) -> Callable[[View], Blended]:
+            return partial(collect, method=method._replace(lanes=lanes))
+
+        return over_views(in_lanes, height * width)(view)
 
     def with_edges(image: Array, sums: Sums | None) -> Array:
         assert sums is not None

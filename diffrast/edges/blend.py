@@ -61,12 +61,14 @@ class Method(NamedTuple):
         glow: what one light adds to the colours, `glow(scene, light, face, barycentrics)`.
         cull_backfaces: whether only front faces are drawn.
         capacity: rows of the records; 0 for a picture alone, of which nothing is recorded.
+        lanes: how many times as many of each list are worked off at once as on a CPU.
     """
 
     shader: Shader | None
     glow: Glow | None
     cull_backfaces: bool
     capacity: int
+    lanes: int
 
 
 class Sums(NamedTuple):

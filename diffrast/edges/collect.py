@@ -126,26 +126,28 @@ def _edges(
     order, count = choose_edges(edges, volume, view.apart)
     z = stored(view.positions_clip[:, 2])
     bare_blocks = blocks_with_background(view.face_image)
+    cut_at_once, pieces_at_once = method.lanes * CUT_AT_ONCE, method.lanes * PIECES_AT_ONCE
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
             edge, exists, edges, view.faces, pixels, z, volume, height=height, width=width
         )
         ends = prefix_sum(segments.parts)
-        cuts = batches_of(ends[-1], CUT_AT_ONCE)
+        cuts = batches_of(ends[-1], cut_at_once)
 
         def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
             n, waiting = state
-            pieces = cut(segments, ends, n * CUT_AT_ONCE, height=height, width=width)
+            first = n * cut_at_once
+            pieces = cut(segments, ends, first, at_once=cut_at_once, height=height, width=width)
             pieces = uncovered(pieces, segments, view.faces, pixels, view.face_image)
             return n + 1, behind(waiting, *gathered(pieces))
 
         def are_few(state: tuple[Array, Waiting]) -> Array:
-            return (state[0] < cuts) & (state[1].total < PIECES_AT_ONCE)
+            return (state[0] < cuts) & (state[1].total < pieces_at_once)
 
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
-            pieces = first_ones(waiting)
+            pieces = first_ones(waiting, pieces_at_once)
             found, left = look(
                 pieces,
                 segments,
@@ -163,10 +165,10 @@ def _edges(
             left = (state[0] < cuts) | (state[1].total > 0)
             return left if goes_on is None else left & goes_on(state[2])
 
-        start = ends[-1] & 0, none_waiting(segments), total
+        start = ends[-1] & 0, none_waiting(segments, cut_at_once + pieces_at_once), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    return Work(order, count, EDGES_AT_ONCE, add_edges)
+    return Work(order, count, method.lanes * EDGES_AT_ONCE, add_edges)
 
 
 def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: Array) -> Work:
@@ -174,6 +176,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
     order, count = choose_pixels(view.face_image, bodies, unseen)
+    lines_at_once = method.lanes * LINES_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = stored(jnp.stack([number % width, number // width]))
@@ -191,15 +194,16 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
             return with_line(total, view, method, lines_of(crossings, pair, exists))
 
-        return over_batches(crossings.pairs, crossings.total, LINES_AT_ONCE, add_lines, total)
+        return over_batches(crossings.pairs, crossings.total, lines_at_once, add_lines, total)
 
-    return Work(order, count, PIXELS_AT_ONCE, add_pixels)
+    return Work(order, count, method.lanes * PIXELS_AT_ONCE, add_pixels)
 
 
 def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
     """The outlines of shadows."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     order, count = choose_shadowed(cast)
+    shadows_at_once = method.lanes * SHADOWS_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         light = number // (width * height)
@@ -214,6 +218,6 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
         def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
             return with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))
 
-        return over_batches(outlines.lines, outlines.total, SHADOWS_AT_ONCE, add_lines, total)
+        return over_batches(outlines.lines, outlines.total, shadows_at_once, add_lines, total)
 
-    return Work(order, count, SHADOWED_AT_ONCE, add_pixels)
+    return Work(order, count, method.lanes * SHADOWED_AT_ONCE, add_pixels)

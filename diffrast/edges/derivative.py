@@ -11,38 +11,41 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrast._device import over_views
 from diffrast._selection import batches_of
 from diffrast._stored import stored
 from diffrast.edges.blend import Method, View, cropped
 from diffrast.edges.collect import collect
 from diffrast.edges.records import Records, Start
 
-_ROWS_AT_ONCE = 1024
+ROWS_AT_ONCE = 1024
 
 
 def _over_rows(
     records: Records,
+    at_once: int,
     add: Callable[[Array, Any, Any], Any],
     start: Any,
     applies: Array | bool = True,
 ) -> Any:
-    """Add up what each block of rows contributes; `used` masks the rows behind the last.
+    """Add up what each block of rows contributes; `used` masks those that do not count.
 
     Where it does not apply no row does: of a condition the branches would copy what they add to.
     """
     capacity = records.jump.shape[0]
-    rows_at_once = min(_ROWS_AT_ONCE, capacity)
+    at_once = min(at_once, capacity)
     count = jnp.where(applies, jnp.minimum(records.total - records.row, capacity), 0)
 
     def step(n: Array, total: Any) -> Any:
-        used = n * rows_at_once + jnp.arange(rows_at_once) < count
-        rows = [
-            lax.dynamic_slice_in_dim(column, n * rows_at_once, rows_at_once)
-            for column in records.columns
-        ]
+        first = begin = n * at_once
+        if capacity % at_once:  # the last block begins among the rows of the one before
+            begin = jnp.minimum(first, capacity - at_once)
+        number = begin + jnp.arange(at_once)
+        used = number < count if begin is first else (number >= first) & (number < count)
+        rows = [lax.dynamic_slice_in_dim(column, begin, at_once) for column in records.columns]
         return add(used, rows, total)
 
-    return lax.fori_loop(0, batches_of(count, rows_at_once), step, start)
+    return lax.fori_loop(0, batches_of(count, at_once), step, start)
 
 
 def _over_pieces(
@@ -62,7 +65,7 @@ def _over_pieces(
         found = collect(view, method, start).records
         assert found is not None
         for n, add in enumerate(adds):
-            total = _over_rows(found, add, total, which == n)
+            total = _over_rows(found, at_once, add, total, which == n)
         ended = found.following.row >= records.total
         following = jax.tree.map(
             lambda again, next: jnp.where(ended, again, next), records.following, found.following
@@ -72,10 +75,11 @@ def _over_pieces(
     def is_left(state: tuple[Array, Start, Any]) -> Array:
         return state[0] < len(adds)
 
-    total = _over_rows(records, adds[0], total)
+    at_once = method.lanes * ROWS_AT_ONCE
+    total = _over_rows(records, at_once, adds[0], total)
     which = jnp.where(records.following.row < records.total, 0, len(adds))
     total = lax.while_loop(is_left, step, (which, records.following, total))[2]
-    return _over_rows(records, adds[1], total) if len(adds) > 1 else total
+    return _over_rows(records, at_once, adds[1], total) if len(adds) > 1 else total
 
 
 def _push(
@@ -168,18 +172,21 @@ def apply_linear(
     parts of its right side, and what comes out on all parts of its solution, if only by one number
     each: derivatives of it and of its transpose, again, leave out none.
     """
-    one_by_one = jax.custom_batching.sequential_vmap
+
+    def each_view(apply: Callable[..., Any]) -> Callable[..., Any]:
+        def in_lanes(lanes: int) -> Callable[..., Any]:
+            return lambda view, *rest: apply(view, method._replace(lanes=lanes), *rest)
+
+        return over_views(in_lanes, rims.size)
 
     def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         return x
 
     def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        push = one_by_one(lambda view, *rest: _push(view, method, *rest))
-        return b[0], b[1], push(view, records, rims, *b)
+        return b[0], b[1], each_view(_push)(view, records, rims, *b)
 
     def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        pull = one_by_one(lambda view, *rest: _pull(view, method, *rest))
-        return *pull(view, records, rims, b[2]), b[2]
+        return *each_view(_pull)(view, records, rims, b[2]), b[2]
 
     nothing = jnp.zeros_like(cropped(colors, view.image.shape)).at[0, 0].add(0 * points[0, 0])
     right = points, colors, nothing

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import draws_on_cpu, in_strides
 from diffrast._selection import compacted, over_batches
 from diffrast._stored import stored
 from diffrast.edges.planes import Table, corners_of, edge_values
@@ -118,11 +119,14 @@ def walk(
             steps, _, there = state
             return (steps < _STEPS) & ~jnp.all(there)
 
-        _, end, there = lax.while_loop(is_on_the_way, step, (start[0] & 0, start, ~exists))
+        _, end, there = lax.while_loop(
+            is_on_the_way, in_strides(step), (start[0] & 0, start, ~exists)
+        )
         place = jnp.where(exists, way, face.size)
         ends, arrived = total
         return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
 
     nowhere = jnp.minimum(face, -1), face < 0
-    ends, arrived = over_batches(order, count, _WAYS_AT_ONCE, go, nowhere)
+    at_once = _WAYS_AT_ONCE if draws_on_cpu() else face.size
+    ends, arrived = over_batches(order, count, at_once, go, nowhere)
     return ends.reshape(shape), arrived.reshape(shape)

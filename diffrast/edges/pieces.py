@@ -220,14 +220,20 @@ def _forward(ends: Array) -> tuple[Array, Array]:
     return start - jnp.floor(start), end - start
 
 
-@partial(jax.jit, static_argnames=("height", "width"))
+@partial(jax.jit, static_argnames=("at_once", "height", "width"))
 def cut(
-    segments: Segments, ends: Int[Array, " n"], first_piece: Array, *, height: int, width: int
+    segments: Segments,
+    ends: Int[Array, " n"],
+    first_piece: Array,
+    *,
+    at_once: int,
+    height: int,
+    width: int,
 ) -> Pieces:
     """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their counts."""
-    number = first_piece + jnp.arange(CUT_AT_ONCE)
+    number = first_piece + jnp.arange(at_once)
     # As many segments end before or at each piece's number.
-    ended = jnp.zeros(CUT_AT_ONCE, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
+    ended = jnp.zeros(at_once, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
     segment = prefix_sum(ended.add(1, mode="drop"))
     exists = segment < ends.shape[0]
     segment = stored(jnp.minimum(segment, ends.shape[0] - 1))
@@ -262,9 +268,9 @@ class Waiting(NamedTuple):
     total: Int[Array, ""]
 
 
-def none_waiting(segments: Segments) -> Waiting:
-    """Room for pieces of segments."""
-    integer = jnp.zeros(PIECES_AT_ONCE + CUT_AT_ONCE, jnp.int32) + (segments.parts[0] & 0)
+def none_waiting(segments: Segments, room: int) -> Waiting:
+    """Room for so many pieces of segments."""
+    integer = jnp.zeros(room, jnp.int32) + (segments.parts[0] & 0)
     ends = jnp.stack([integer, integer])
     pieces = Pieces(integer, ends, ends.astype(segments.range.dtype), integer > 0)
     return Waiting(pieces, segments.parts[0] & 0)
@@ -279,13 +285,13 @@ def behind(waiting: Waiting, pieces: Pieces, count: Array) -> Waiting:
     return Waiting(jax.tree.map(put, waiting.pieces, pieces), waiting.total + count)
 
 
-def first_ones(waiting: Waiting) -> Pieces:
+def first_ones(waiting: Waiting, at_once: int) -> Pieces:
     """As many as are looked at at once; in parts, each of them, if these are few.
 
     What hides a piece here and there is found one part after the other.
     """
     parts = jnp.where(waiting.total <= FEW, PARTS, 1)
-    number = jnp.arange(PIECES_AT_ONCE)
+    number = jnp.arange(at_once)
     piece, part = number // parts, number % parts
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
     begin, end = range_
@@ -298,9 +304,9 @@ def first_ones(waiting: Waiting) -> Pieces:
 def instead_of_first(waiting: Waiting, pieces: Pieces) -> Waiting:
     """What waits if only those of others that exist take the place of the `first_ones`."""
     pieces, count = gathered(pieces)
-    others = jax.tree.map(lambda column: column[..., PIECES_AT_ONCE:], waiting.pieces)
+    others = jax.tree.map(lambda column: column[..., pieces.exists.size :], waiting.pieces)
     room = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), pieces, others)
-    rest = jnp.maximum(waiting.total - PIECES_AT_ONCE, 0)
+    rest = jnp.maximum(waiting.total - pieces.exists.size, 0)
     return behind(Waiting(room, count), others, rest)
 
 

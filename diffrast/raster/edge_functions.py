@@ -28,8 +28,10 @@ from diffrast.raster.fixed_point import (
     twice_area_sign,
 )
 
-# |A columns + B rows| over a block of 32×32 pixels, with |A|, |B| <= 2**23, stays below this, and
-# this plus that stays below 2**31: a saturated edge value keeps its sign all over the block.
+TILE = (32, 32)  # rows and columns, powers of two: from its corner on a large face is evaluated
+
+# |A columns + B rows| over a tile, with |A|, |B| <= 2**23, stays below this, and this plus that
+# stays below 2**31: a saturated edge value keeps its sign all over the tile.
 _SATURATED = 1 << 29
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import lanes
 from diffrast._selection import compacted, over_batches, selected, work_off
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
@@ -73,7 +74,8 @@ def lit(
     least = floor + slope_x * texel.x + slope_y * texel.y
     bright = rays.asked & (rays.key >= least - _rounding(rays))
     order, count = selected(rays.asked & jnp.isinf(floor))
-    at_once = min(_AT_ONCE, 512 * -(-rays.x.size // 4096))  # some of few, as edges have
+    few = 512 * -(-rays.x.size // 4096)  # of few, as edges have
+    at_once = min(lanes() * min(_AT_ONCE, few), rays.x.size)
 
     def look_closer(chosen: Array, exists: Array, bright: Array) -> Array:
         some = _entries(rays, chosen)
@@ -128,6 +130,7 @@ def _hidden(
     or on an endless way from the nearest texel, one cannot know what is beyond.
     """
     count, nine = doubt.size, jnp.arange(9)[:, None]
+    at_once = lanes() * _WAYS_AT_ONCE
 
     def begin(way: Array) -> _Way:
         face = at_texels(pictures.face, stored(sight.texels.reshape(-1)[way]))
@@ -150,7 +153,7 @@ def _hidden(
     def follow(turn: Array, fate: Array) -> Array:
         others = (nine != 4) & (sight.before > 0) & (fate < _HIDDEN)
         ways, size = selected(jnp.ravel(doubt & jnp.where(turn == 0, nine == 4, others)))
-        return work_off(size, _WAYS_AT_ONCE, lambda slot: begin(ways[slot]), walk, fate)
+        return work_off(size, at_once, lambda slot: begin(ways[slot]), walk, fate)
 
     fate = lax.fori_loop(0, 2, follow, (doubt & False).astype(jnp.int32))
     order, size = compacted(fate == _LOST, jnp.arange(count, dtype=jnp.int32))
@@ -159,7 +162,7 @@ def _hidden(
         some = _is_hidden_by_small(pictures, geometry, _entries(rays, ray), _entries(sight, ray))
         return hidden.at[ray].max(some & exists)
 
-    return over_batches(order, size, _WAYS_AT_ONCE, guess, fate == _HIDDEN)
+    return over_batches(order, size, at_once, guess, fate == _HIDDEN)
 
 
 def _across(

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import in_strides, lanes
 from diffrast._selection import over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
@@ -117,7 +118,7 @@ def _between_pixels(
         return edges.at[place].set(edge, mode="drop")
 
     none = jnp.full(pairs.size, -1, jnp.int32) + zero_after(count)
-    return over_batches(order, count, _AT_ONCE, look, none).reshape(pairs.shape)
+    return over_batches(order, count, lanes() * _AT_ONCE, look, none).reshape(pairs.shape)
 
 
 def _pairs(
@@ -247,7 +248,7 @@ def _follow(
 
     nothing = jnp.zeros_like(face)
     start = jnp.sum(nothing), face, nothing - 1, jnp.zeros_like(ends[0][0]), face < -1, face < 0
-    _, _, edge, _, found, _ = lax.while_loop(is_on_the_way, step, start)
+    _, _, edge, _, found, _ = lax.while_loop(is_on_the_way, in_strides(step), start)
     return stored(jnp.where(found, _named_once(edge, neighbors), -1))
 
 

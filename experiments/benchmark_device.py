@@ -1,0 +1,201 @@
+"""The whole pipeline on the device that JAX draws with: how fast, and does it see what a CPU sees?
+
+    python experiments/benchmark_device.py [--sizes 64 512 1024] [--views 1 16 128 1024]
+
+First, pixel by pixel, the face ids of each scene on the device and on the CPU. Then milliseconds
+of the ids alone, of pictures and of gradients by the camera, the light's direction and the object's
+place, with and without edges: of a sphere of 20,480 faces in all sizes, of the other scenes in the
+largest. Then views of 64² at once, under `vmap`. Every number is a minimum, and what is timed ends
+when the result is there; "first" is the first call in seconds.
+
+Written to `--out`: `benchmark_device.json`, `.md` and `.png`.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from benchmark_raster import scenes
+from benchmark_views import cameras
+from common import pyplot
+from timing import benchmark_options, compiled, markdown, write_report
+
+import diffrast as dr
+from diffrast.raster.coverage import visible_faces
+
+SIZES, VIEWS, VIEW_SIZE = (64, 512, 1024), (1, 16, 128, 1024), 64
+TIMED = "sphere, 20,480 faces"
+
+
+def all_scenes() -> dict[str, tuple[dr.Mesh, dr.Camera]]:
+    """Those of `benchmark_raster`, and the one that is timed, first."""
+    others = scenes()
+    camera = others["sphere, 5,120 faces"][1]
+    return {TIMED: (dr.shapes.icosphere(5), camera), **others}
+
+
+def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """The first call in seconds, and the fastest of the others in milliseconds."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(job())
+        times.append(time.perf_counter() - start)
+    return {"first_s": times[0], "ms": 1e3 * min(times[1:])}
+
+
+def different_ids(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, int]:
+    """Pixels that show a face, and those that show another one on the CPU."""
+    ids = partial(visible_faces, height=size, width=size, cull_backfaces=False)
+    arguments = dr.world_to_clip(camera, mesh.vertices), jnp.asarray(mesh.faces)
+    here = np.asarray(ids(*arguments))
+    cpu = jax.devices("cpu")[0]
+    there = np.asarray(ids(*jax.device_put(jax.device_get(arguments), cpu)))
+    return {"covered": int((there >= 0).sum()), "different": int((here != there).sum())}
+
+
+def scene_of(mesh: dr.Mesh, direction: Any, offset: Any) -> dr.Scene:
+    item = dr.Object(mesh, dr.Material(specular=(0.5,) * 3), dr.linalg.translation(offset))
+    light = dr.DirectionalLight(direction=direction, ambient=(0.1,) * 3)
+    return dr.Scene(objects=[item], lights=[light])
+
+
+def picture(
+    settings: dr.RenderSettings,
+    mesh: dr.Mesh,
+    camera: dr.Camera,
+    direction: Any = (-1.0, -1.0, -2.0),
+    offset: Any = (0.0, 0.0, 0.0),
+) -> jax.Array:
+    return dr.render(scene_of(mesh, direction, offset), camera, settings)
+
+
+def gradient(settings: dr.RenderSettings, mesh: dr.Mesh, camera: dr.Camera) -> Any:
+    """Of the sum of squares, by the camera, the light's direction and the object's place."""
+
+    def loss(*parameters: Any) -> jax.Array:
+        return jnp.sum(picture(settings, mesh, *parameters) ** 2)
+
+    return jax.grad(loss, (0, 1, 2))(camera, jnp.array([-1.0, -1, -2]), jnp.zeros(3))
+
+
+def pipelines(size: int) -> dict[str, tuple[Callable[..., Any], dr.RenderSettings]]:
+    """Functions of a mesh and a camera, once the settings are given; the cheapest first."""
+    edges = dr.RenderSettings(height=size, width=size)
+    bare = dr.RenderSettings(height=size, width=size, antialias=False)
+    return {
+        f"{kind}{word}": (function, settings)
+        for kind, function in (("picture", picture), ("gradient", gradient))
+        for word, settings in ((", no edges", bare), ("", edges))
+    }
+
+
+def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Callable[[], Any]]:
+    """What is timed of one view, from the cheapest on."""
+    ids = partial(visible_faces, height=size, width=size, cull_backfaces=False)
+    clip, faces = dr.world_to_clip(camera, mesh.vertices), jnp.asarray(mesh.faces)
+    jobs: dict[str, Callable[[], Any]] = {"ids": lambda: ids(clip, faces)}
+    for what, (function, settings) in pipelines(size).items():
+        jobs[what] = compiled(partial(function, settings), mesh, camera)
+    return jobs
+
+
+def many(mesh: dr.Mesh, count: int, size: int) -> dict[str, Callable[[], Any]]:
+    """What is timed of many views at once."""
+    views = cameras(mesh, count)
+    jobs: dict[str, Callable[[], Any]] = {}
+    for what, (function, settings) in pipelines(size).items():
+        of_each = jax.vmap(partial(function, settings), (None, 0))
+        jobs[what] = compiled(of_each, mesh, views)
+    return jobs
+
+
+def run(
+    out: Path,
+    *,
+    sizes: Sequence[int] = SIZES,
+    views: Sequence[int] = VIEWS,
+    view_size: int = VIEW_SIZE,
+    repeats: int = 20,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Compare and measure; return what is written."""
+    device = jax.devices()[0]
+    report: dict[str, Any] = {"device": device.device_kind, "ids": [], "stages": [], "views": []}
+
+    def add(part: str, row: dict[str, Any]) -> None:
+        report[part].append(row)
+        if progress:
+            print(row, flush=True)
+
+    known = all_scenes()
+    for size in sizes:
+        for name, (mesh, camera) in known.items():
+            add("ids", {"scene": name, "size": size, **different_ids(mesh, camera, size)})
+    for name, (mesh, camera) in known.items():
+        for size in sizes if name == TIMED else sizes[-1:]:
+            for what, job in stages(mesh, camera, size).items():
+                if name == TIMED or what in ("ids", "picture", "gradient"):
+                    row = {"scene": name, "what": what, "size": size}
+                    add("stages", row | timed(job, repeats))
+    mesh = known["sphere, 5,120 faces"][0]
+    for count in views:
+        for what, job in many(mesh, count, view_size).items():
+            found = timed(job, repeats)
+            row = {"what": what, "size": view_size, "views": count, **found}
+            add("views", row | {"a_second": 1e3 * count / found["ms"]})
+    write_report(out, "benchmark_device", report, table, plot)
+    return report
+
+
+def table(report: dict[str, Any]) -> str:
+    """On which device; ids, stages and views."""
+    parts = {
+        "ids": ["scene", "size", "covered", "different"],
+        "stages": ["scene", "what", "size", "first_s", "ms"],
+        "views": ["what", "size", "views", "first_s", "ms", "a_second"],
+    }
+    tables = [
+        markdown(header, [[row[key] for key in header] for row in report[part]])
+        for part, header in parts.items()
+    ]
+    return "\n\n".join([report["device"], *tables])
+
+
+def plot(report: dict[str, Any], path: Path) -> None:
+    """Milliseconds over the pixels of one view, and views a second over their number."""
+    plt = pyplot()
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for axis, part, x, y in zip(
+        axes, ("stages", "views"), ("size", "views"), ("ms", "a_second"), strict=True
+    ):
+        lines: dict[str, list[dict[str, Any]]] = {}
+        for row in report[part]:
+            if row.get("scene", TIMED) == TIMED:
+                lines.setdefault(row["what"], []).append(row)
+        for what, rows in lines.items():
+            axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=what)
+        axis.set_xlabel({"size": "rows of pixels", "views": "views at once"}[x])
+        axis.set_ylabel({"ms": "milliseconds", "a_second": "views a second"}[y])
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize="small")
+    figure.suptitle(report["device"])
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = benchmark_options(__doc__, "benchmark_device", repeats=20)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
+    options = vars(parser.parse_args())
+    print(table(run(options.pop("out"), progress=not options.pop("quiet"), **options)))
+
+
+if __name__ == "__main__":
+    main()
