@@ -5,8 +5,8 @@
 First, pixel by pixel, the face ids of each scene on the device and on the CPU. Then milliseconds
 of the ids alone, of pictures and of gradients by the camera, the light's direction and the object's
 place, with and without edges: of a sphere of 20,480 faces in all sizes, of the other scenes in the
-largest. Then views of 64² at once, under `vmap`. Every number is a minimum, and what is timed ends
-when the result is there; "first" is the first call in seconds.
+largest. Then views at 64² of a sphere of 5,120 faces at once, under `vmap`. Every number is a
+minimum, and what is timed ends when the result is there; "first" is the first call in seconds.
 
 Written to `--out`: `benchmark_device.json`, `.md` and `.png`.
 """
@@ -29,14 +29,13 @@ import diffrast as dr
 from diffrast.raster.coverage import visible_faces
 
 SIZES, VIEWS, VIEW_SIZE = (64, 512, 1024), (1, 16, 128, 1024), 64
-TIMED = "sphere, 20,480 faces"
 
 
 def all_scenes() -> dict[str, tuple[dr.Mesh, dr.Camera]]:
-    """Those of `benchmark_raster`, and the one that is timed, first."""
+    """Those of `benchmark_raster`, and the one that is timed in all sizes, first."""
     others = scenes()
     camera = others["sphere, 5,120 faces"][1]
-    return {TIMED: (dr.shapes.icosphere(5), camera), **others}
+    return {"sphere, 20,480 faces": (dr.shapes.icosphere(5), camera), **others}
 
 
 def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
@@ -84,32 +83,39 @@ def gradient(settings: dr.RenderSettings, mesh: dr.Mesh, camera: dr.Camera) -> A
     return jax.grad(loss, (0, 1, 2))(camera, jnp.array([-1.0, -1, -2]), jnp.zeros(3))
 
 
-def pipelines(size: int) -> dict[str, tuple[Callable[..., Any], dr.RenderSettings]]:
+def pipelines(
+    size: int, antialias: bool
+) -> dict[str, tuple[Callable[..., Any], dr.RenderSettings]]:
     """Functions of a mesh and a camera, once the settings are given; the cheapest first."""
-    edges = dr.RenderSettings(height=size, width=size)
-    bare = dr.RenderSettings(height=size, width=size, antialias=False)
+    kinds = {", no edges": dr.RenderSettings(height=size, width=size, antialias=False)}
+    if antialias:
+        kinds[""] = dr.RenderSettings(height=size, width=size)
     return {
-        f"{kind}{word}": (function, settings)
-        for kind, function in (("picture", picture), ("gradient", gradient))
-        for word, settings in ((", no edges", bare), ("", edges))
+        f"{what}{word}": (function, settings)
+        for what, function in (("picture", picture), ("gradient", gradient))
+        for word, settings in kinds.items()
     }
 
 
-def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Callable[[], Any]]:
+def stages(
+    mesh: dr.Mesh, camera: dr.Camera, size: int, antialias: bool = True
+) -> dict[str, Callable[[], Any]]:
     """What is timed of one view, from the cheapest on."""
     ids = partial(visible_faces, height=size, width=size, cull_backfaces=False)
     clip, faces = dr.world_to_clip(camera, mesh.vertices), jnp.asarray(mesh.faces)
     jobs: dict[str, Callable[[], Any]] = {"ids": lambda: ids(clip, faces)}
-    for what, (function, settings) in pipelines(size).items():
+    for what, (function, settings) in pipelines(size, antialias).items():
         jobs[what] = compiled(partial(function, settings), mesh, camera)
     return jobs
 
 
-def many(mesh: dr.Mesh, count: int, size: int) -> dict[str, Callable[[], Any]]:
+def many(
+    mesh: dr.Mesh, count: int, size: int, antialias: bool = True
+) -> dict[str, Callable[[], Any]]:
     """What is timed of many views at once."""
     views = cameras(mesh, count)
     jobs: dict[str, Callable[[], Any]] = {}
-    for what, (function, settings) in pipelines(size).items():
+    for what, (function, settings) in pipelines(size, antialias).items():
         of_each = jax.vmap(partial(function, settings), (None, 0))
         jobs[what] = compiled(of_each, mesh, views)
     return jobs
@@ -122,6 +128,8 @@ def run(
     views: Sequence[int] = VIEWS,
     view_size: int = VIEW_SIZE,
     repeats: int = 20,
+    known: dict[str, tuple[dr.Mesh, dr.Camera]] | None = None,
+    antialias: bool = True,
     progress: bool = False,
 ) -> dict[str, Any]:
     """Compare and measure; return what is written."""
@@ -133,19 +141,20 @@ def run(
         if progress:
             print(row, flush=True)
 
-    known = all_scenes()
+    known = known or all_scenes()
+    first = next(iter(known))
     for size in sizes:
         for name, (mesh, camera) in known.items():
             add("ids", {"scene": name, "size": size, **different_ids(mesh, camera, size)})
     for name, (mesh, camera) in known.items():
-        for size in sizes if name == TIMED else sizes[-1:]:
-            for what, job in stages(mesh, camera, size).items():
-                if name == TIMED or what in ("ids", "picture", "gradient"):
+        for size in sizes if name == first else sizes[-1:]:
+            for what, job in stages(mesh, camera, size, antialias).items():
+                if name == first or what in ("ids", "picture", "gradient"):
                     row = {"scene": name, "what": what, "size": size}
                     add("stages", row | timed(job, repeats))
-    mesh = known["sphere, 5,120 faces"][0]
+    mesh = dr.shapes.icosphere(4)
     for count in views:
-        for what, job in many(mesh, count, view_size).items():
+        for what, job in many(mesh, count, view_size, antialias).items():
             found = timed(job, repeats)
             row = {"what": what, "size": view_size, "views": count, **found}
             add("views", row | {"a_second": 1e3 * count / found["ms"]})
@@ -154,7 +163,7 @@ def run(
 
 
 def table(report: dict[str, Any]) -> str:
-    """On which device; ids, stages and views."""
+    """Ids, stages and views, and on which device."""
     parts = {
         "ids": ["scene", "size", "covered", "different"],
         "stages": ["scene", "what", "size", "first_s", "ms"],
@@ -164,19 +173,19 @@ def table(report: dict[str, Any]) -> str:
         markdown(header, [[row[key] for key in header] for row in report[part]])
         for part, header in parts.items()
     ]
-    return "\n\n".join([report["device"], *tables])
+    return "\n\n".join([*tables, f"Device: {report['device']}."])
 
 
 def plot(report: dict[str, Any], path: Path) -> None:
     """Milliseconds over the pixels of one view, and views a second over their number."""
-    plt = pyplot()
+    plt, first = pyplot(), report["ids"][0]["scene"]
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for axis, part, x, y in zip(
         axes, ("stages", "views"), ("size", "views"), ("ms", "a_second"), strict=True
     ):
         lines: dict[str, list[dict[str, Any]]] = {}
         for row in report[part]:
-            if row.get("scene", TIMED) == TIMED:
+            if row.get("scene", first) == first:
                 lines.setdefault(row["what"], []).append(row)
         for what, rows in lines.items():
             axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=what)

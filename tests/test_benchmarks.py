@@ -4,6 +4,7 @@ import dataclasses
 import json
 import sys
 
+import benchmark_device
 import benchmark_error
 import benchmark_features
 import benchmark_peers
@@ -300,3 +301,20 @@ def test_views_are_timed(tmp_path):
     more = {"cores": {1: {"picture": 2.0}, 2: {"picture": 1.0}}, "peak_megabytes": {"16 views": 3}}
     more["same_bits"] = {"chunks": [1], "devices": [2]}
     assert "2 cores over one: picture 2.00." in benchmark_views.table(report | more)
+
+
+def test_the_device_is_compared_and_timed(tmp_path):
+    _, camera = benchmark_device.scenes()["sphere, 5,120 faces"]
+    known = {"ball": (dr.shapes.icosphere(1), camera), "cube": (dr.shapes.cube(), camera)}
+    benchmark_device.run(
+        tmp_path, sizes=(8,), views=(2,), view_size=8, repeats=1, known=known, antialias=False
+    )
+    written = read(tmp_path, "benchmark_device")
+    assert [(row["scene"], row["size"], row["different"]) for row in written["ids"]] == [
+        (scene, 8, 0) for scene in known
+    ]
+    rows = [(row["scene"], row["what"], row["size"]) for row in written["stages"]]
+    whats = ("ids", "picture, no edges", "gradient, no edges")
+    assert rows == [*(("ball", what, 8) for what in whats), ("cube", "ids", 8)]
+    assert [row["what"] for row in written["views"]] == list(whats[1:])
+    assert all(row["ms"] > 0 for row in written["stages"] + written["views"])
