@@ -52,6 +52,10 @@ _DIRECTION, _FIRST, _SECOND = np.array(
 ).T
 
 
+# Of the 3×3 pixels, from the middle one's: x and y.
+_CENTRES = np.stack([np.arange(9) % 3 - 1, np.arange(9) // 3 - 1]).astype(np.float32)
+
+
 class Cast(NamedTuple):
     """The shadows of a scene, by their lights."""
 
@@ -182,12 +186,23 @@ def cross_shadows(
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
     linked = meets[0] | meets[1]
     primary = valid & (jnp.arange(12)[:, None] == first_row(valid))
-    chosen = primary
+    chain = primary
     for _ in range(2):
-        chosen = chosen | jnp.any(linked & chosen, axis=1)
+        chain = chain | jnp.any(linked & chain, axis=1)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
+    beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
     first = jnp.sum(jnp.where(primary, outwards, 0), axis=1)
-    chosen = chosen | (valid & (_dot(outwards, first[:, None]) < _OPPOSITE))
+    chosen = chain | (valid & (_dot(outwards, first[:, None]) < _OPPOSITE))
+
+    # Where several shadows meet, their outlines end at each other.
+    lit, counts = _lit_round(places, own, cast, face_image)
+    told = _dot(outwards, jnp.asarray(_CENTRES)[..., None, None]) > beyond
+    both = jnp.all(told | ~valid, axis=1)
+    either = jnp.any(told & valid, axis=1)
+    wrong = [jnp.sum((one != lit) & counts, axis=0) for one in (both, either)]
+    meet = jnp.any(valid & ~chain, axis=0) & (wrong[0] < wrong[1])
+    chosen = jnp.where(meet, valid, chosen)
+    ends_others = meet & valid[:, None] & valid & (chain[:, None] != chain)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
     sign = jnp.where(ground.offset < 0, -1, 1)
@@ -200,10 +215,16 @@ def cross_shadows(
     def inside(at: Array) -> list[Array]:
         x, y = at
         square = [0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y]
-        return square + [
+        ends_here = [
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
         ]
+        distance = [outwards[0, k] * x + outwards[1, k] * y - beyond[k] for k in range(12)]
+        return (
+            square
+            + ends_here
+            + [jnp.where(ends_others[:, k], d, 1) for k, d in enumerate(distance)]
+        )
 
     low, high = positive_part(inside(foot - along), inside(foot + along))
     chosen = chosen & (low < high)
@@ -312,6 +333,18 @@ def shadow_of(
         vertices=jnp.stack(vertices).reshape(4, 2, -1),
         motion=jnp.where(exists, motion, 0),
     )
+
+
+def _lit_round(
+    places: Places, own: Array, cast: Cast, face_image: Array
+) -> tuple[Bool[Array, "9 n"], Bool[Array, "9 n"]]:
+    """Which of the 3×3 pixels round pixels are lit, and which show the same surface, shone on."""
+    nine = jnp.arange(9)[:, None]
+    row, column = places.pixel[1] + nine // 3, places.pixel[0] + nine % 3
+    face = stored(face_image[row, column])
+    seen = jnp.maximum(face, 0)
+    same = (face >= 0) & (cast.patches[seen] == cast.patches[jnp.maximum(own, 0)])
+    return cast.lit[places.light, row, column], same & cast.turned[places.light, seen]
 
 
 def _dot(a: Array, b: Array) -> Array:
