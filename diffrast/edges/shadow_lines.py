@@ -41,6 +41,7 @@ PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
+_BESIDE = 0.1  # how far beyond pixels a line may pass that parts them, of half their distance
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
@@ -180,7 +181,12 @@ def cross_shadows(
     normal, foot, inverse = stored(_line(ground, shadow))
     second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
     lit_on_right = second_on_right != cast.lit[light, row, column]
-    valid = valid & (inverse > 0)
+    # Of an edge that hides something else the line passes elsewhere.
+    first, second = (
+        _dot(normal, jnp.asarray(_CENTRES)[:, look][..., None] - foot) for look in (_FIRST, _SECOND)
+    )
+    apart = jnp.abs(first + second) <= (1 + _BESIDE) * jnp.abs(first - second)
+    valid = valid & (inverse > 0) & apart
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]

@@ -32,6 +32,7 @@ from diffrast.shadows.views import cube_side, sides
 _AT_ONCE = 256
 _STEPS = 64  # from face to face
 
+_Search = tuple[Array, Array, Array, Array, Array]
 _State = tuple[Array, Array, Array, Array, Array, Array]
 
 
@@ -195,6 +196,7 @@ def _edge_between(
     def corners_of(face: Array) -> Array:
         return seen(face_corners(geometry, face))
 
+    face = _covering(face, farthest < 0, topology.neighbors, corners_of, ends[0])
     return _follow(face, topology.neighbors, corners_of, ends)
 
 
@@ -221,6 +223,37 @@ def _leaves(
     part = jnp.minimum(jnp.minimum(parts[0], parts[1]), parts[2])
     corner = jnp.where(parts[0] == part, 0, jnp.where(parts[1] == part, 1, 2))
     return stored((part, corner.astype(jnp.int32), volume))
+
+
+def _covering(
+    face: Int[Array, " n"],
+    searched: Bool[Array, " n"],
+    neighbors: Int[Array, "F 3"],
+    corners_of: Callable[[Array], Array],
+    end: list[Array],
+) -> Int[Array, " n"]:
+    """The face of the same surface that hides a point, where one is searched for; or the same."""
+
+    def step(state: _Search) -> _Search:
+        steps, there, turn, goes, found = state
+        values, volume = edge_functions(corners_of(there), *end)
+        sign = jnp.sign(volume)
+        goes = goes & (there >= 0) & ((turn == 0) | (sign == turn))
+        inside = [value * sign for value in values]
+        least = jnp.minimum(jnp.minimum(inside[0], inside[1]), inside[2])
+        arrives = goes & (least >= 0)
+        corner = jnp.where(inside[0] == least, 0, jnp.where(inside[1] == least, 1, 2))
+        following = neighbors[jnp.maximum(there, 0), corner]
+        goes_on = goes & ~arrives
+        found = jnp.where(arrives, there, found)
+        return stored((steps + 1, jnp.where(goes_on, following, there), sign, goes_on, found))
+
+    def is_on_the_way(state: _Search) -> Array:
+        return (state[0] < _STEPS) & jnp.any(state[3])
+
+    zero = jnp.zeros_like(end[0])
+    start = jnp.sum(jnp.zeros_like(face)), face, zero, searched & (face >= 0), face
+    return lax.while_loop(is_on_the_way, in_strides(step), start)[-1]
 
 
 def _follow(
