@@ -459,3 +459,31 @@ def test_large_pictures_are_shaded_as_small_ones(monkeypatch, very_large):
         monkeypatch.setattr(deferred, "VERY_LARGE", 0)
     large = jax.jit(lambda *arguments: dr.render.__wrapped__(*arguments))(*arguments)
     np.testing.assert_allclose(large, small, atol=1e-6)
+
+
+def test_outlines_of_several_shadows_end_at_each_other():
+    """Of three bars behind the camera; also at their corners."""
+    turns = ((0.4, 3.0, 0.25), (1.3, 3.4, 0.3), (2.3, 3.8, 0.2))
+    bars = [
+        dr.Object(
+            shapes.cube(),
+            transform=linalg.compose(
+                linalg.translation((0, height, 0)),
+                linalg.rotation_y(turn),
+                linalg.scaling((1.5, 0.03, width)),
+            ),
+        )
+        for turn, height, width in turns
+    ]
+    floor_ = dr.Object(shapes.plane(40.0, 40.0), transform=linalg.rotation_x(-np.pi / 2))
+    camera = dr.Camera.perspective(
+        eye=(2.7, 2, -1.3), target=(2.6, 0, -1.5), up=(0, 0, -1), fov_y=1.3, near=0.1, far=50
+    )
+    scene = dr.Scene(objects=[floor_, *bars], lights=[sun((0.8, -1, -0.45))])
+
+    def picture(**options):
+        options = dr.RenderSettings(height=48, width=48, shading="flat", **options)
+        return np.float64(dr.render(scene, camera, options))
+
+    want = picture(antialias=False, samples=256)
+    assert np.mean(np.abs(picture() - want)) < 3e-4  # of 16 samples 1.1e-3

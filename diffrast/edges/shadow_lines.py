@@ -200,15 +200,17 @@ def cross_shadows(
     first = jnp.sum(jnp.where(primary, outwards, 0), axis=1)
     chosen = chain | (valid & (_dot(outwards, first[:, None]) < _OPPOSITE))
 
-    # Where several shadows meet, their outlines end at each other.
+    # Outlines that are not linked end at each other: those of several shadows where all of them let
+    # the light pass, at the corner of one shadow where the other one does not.
     lit, counts = _lit_round(places, own, cast, face_image)
     told = _dot(outwards, jnp.asarray(_CENTRES)[..., None, None]) > beyond
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
     wrong = [jnp.sum((one != lit) & counts, axis=0) for one in (both, either)]
-    meet = jnp.any(valid & ~chain, axis=0) & (wrong[0] < wrong[1])
-    chosen = jnp.where(meet, valid, chosen)
-    ends_others = meet & valid[:, None] & valid & (chain[:, None] != chain)
+    known = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
+    chosen = jnp.where(known, valid, chosen)
+    ends_others = known & valid[:, None] & valid & (chain[:, None] != chain)
+    side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
     sign = jnp.where(ground.offset < 0, -1, 1)
@@ -225,7 +227,7 @@ def cross_shadows(
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
         ]
-        distance = [outwards[0, k] * x + outwards[1, k] * y - beyond[k] for k in range(12)]
+        distance = [side * (outwards[0, k] * x + outwards[1, k] * y - beyond[k]) for k in range(12)]
         return (
             square
             + ends_here
