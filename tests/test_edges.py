@@ -242,7 +242,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
 
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
-        method = Method(None, None, False, capacity)
+        method = Method(None, None, False, capacity, lanes=1)
         records, sums = collect(view, method)
         found = view._replace(unseen=sums.unseen)
 
@@ -273,7 +273,7 @@ def test_few_pieces_are_looked_at_in_parts():
     number = jnp.arange(PIECES_AT_ONCE + CUT_AT_ONCE)
     places = jnp.minimum(number, 2)
     pieces = Pieces(places, jnp.stack([number, number]), jnp.asarray(ranges)[:, places], number < 0)
-    few = first_ones(Waiting(pieces, jnp.int32(3)))
+    few = first_ones(Waiting(pieces, jnp.int32(3)), PIECES_AT_ONCE)
     count = int(few.exists.sum())
     begin, end = np.asarray(few.range)[:, :count].reshape(2, 3, -1)
     assert begin.shape[1] > 1
@@ -281,7 +281,7 @@ def test_few_pieces_are_looked_at_in_parts():
     assert np.array_equal(begin[:, 1:], end[:, :-1])
     assert np.array_equal([begin[:, 0], end[:, -1]], ranges)
     assert np.array_equal(few.segment[:count], np.repeat(np.arange(3), begin.shape[1]))
-    many = first_ones(Waiting(pieces, number[-1]))
+    many = first_ones(Waiting(pieces, number[-1]), PIECES_AT_ONCE)
     assert np.array_equal(many.range, pieces.range[:, :PIECES_AT_ONCE])
 
 

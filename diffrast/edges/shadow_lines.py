@@ -182,10 +182,11 @@ def cross_shadows(
     second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
     lit_on_right = second_on_right != cast.lit[light, row, column]
     # Of an edge that hides something else the line passes elsewhere.
-    first, second = (
+    sides = (
         _dot(normal, jnp.asarray(_CENTRES)[:, look][..., None] - foot) for look in (_FIRST, _SECOND)
     )
-    apart = jnp.abs(first + second) <= (1 + _BESIDE) * jnp.abs(first - second)
+    one, other = sides
+    apart = jnp.abs(one + other) <= (1 + _BESIDE) * jnp.abs(one - other)
     valid = valid & (inverse > 0) & apart
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
