@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark_raster import scenes
-from benchmark_views import cameras
+from benchmark_views import cameras, scene_of
 from common import pyplot
-from timing import benchmark_options, compiled, markdown, write_report
+from timing import benchmark_options, compiled, markdown, minimum_times, write_report
 
 import diffrast as dr
 from diffrast.raster.coverage import visible_faces
@@ -40,12 +40,10 @@ def all_scenes() -> dict[str, tuple[dr.Mesh, dr.Camera]]:
 
 def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
     """The first call in seconds, and the fastest of the others in milliseconds."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        jax.block_until_ready(job())
-        times.append(time.perf_counter() - start)
-    return {"first_s": times[0], "ms": 1e3 * min(times[1:])}
+    start = time.perf_counter()
+    jax.block_until_ready(job())
+    first = time.perf_counter() - start
+    return {"first_s": first, "ms": minimum_times({"": job}, repeats)[""]}
 
 
 def different_ids(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, int]:
@@ -56,12 +54,6 @@ def different_ids(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, int]
     cpu = jax.devices("cpu")[0]
     there = np.asarray(ids(*jax.device_put(jax.device_get(arguments), cpu)))
     return {"covered": int((there >= 0).sum()), "different": int((here != there).sum())}
-
-
-def scene_of(mesh: dr.Mesh, direction: Any, offset: Any) -> dr.Scene:
-    item = dr.Object(mesh, dr.Material(specular=(0.5,) * 3), dr.linalg.translation(offset))
-    light = dr.DirectionalLight(direction=direction, ambient=(0.1,) * 3)
-    return dr.Scene(objects=[item], lights=[light])
 
 
 def picture(

@@ -97,8 +97,8 @@ def as_elsewhere(monkeypatch, compiled_quickly):
     def change():
         jax.clear_caches()
         monkeypatch.setattr(jax, "default_backend", lambda: "another")
-        all_drawn = lambda p, f, h, w, c: draw_at_once(p, f, height=h, width=w, cull_backfaces=c)  # noqa: E731
-        monkeypatch.setattr(coverage, "_draw", all_drawn)
+        monkeypatch.setattr(coverage, "draw_one_by_one", draw_at_once)
+        monkeypatch.setattr(coverage, "draws_on_cpu", lambda: True)  # else the platform decides
 
     yield change
     jax.clear_caches()

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,10 +12,10 @@ from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
-from diffrast._device import lanes, over_views
+from diffrast._device import lanes
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
-from diffrast.edges.collect import collect
+from diffrast.edges.collect import collect, each_view
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear, linear_zeros
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -161,10 +160,8 @@ def antialias_image(
     view = view._replace(positions_clip=positions_clip, scale=scale)
 
     def gather(view: View, method: Method) -> Blended:
-        def in_lanes(lanes: int) -> Callable[[View], Blended]:
-            return partial(collect, method=method._replace(lanes=lanes))
-
-        return over_views(in_lanes, height * width)(view)
+        found: Blended = each_view(collect, method, height * width)(view)
+        return found
 
     def with_edges(image: Array, sums: Sums | None) -> Array:
         assert sums is not None

@@ -5,12 +5,13 @@ a batch is under `jax.jit`, which traces it once.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
+from diffrast._device import over_views
 from diffrast._selection import batches_of, over_batches, prefix_sum
 from diffrast._stored import stored, zero_after
 from diffrast.edges.blend import (
@@ -63,6 +64,16 @@ class Work(NamedTuple):
     size: Int[Array, ""]  # of those on the list
     at_once: int
     add: Add
+
+
+def each_view(function: Callable[..., Any], method: Method, pixels: int) -> Callable[..., Any]:
+    """`function(view, method, ...)` without the method: of views under `vmap`, see `over_views`."""
+
+    def in_lanes(lanes: int) -> Callable[..., Any]:
+        own = method._replace(lanes=lanes)
+        return lambda view, *rest: function(view, own, *rest)
+
+    return over_views(in_lanes, pixels)
 
 
 def collect(view: View, method: Method, start: Start | None = None) -> Blended:

@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from diffrast._device import over_views
 from diffrast._selection import batches_of
 from diffrast._stored import stored
 from diffrast.edges.blend import Method, View, cropped
-from diffrast.edges.collect import collect
+from diffrast.edges.collect import collect, each_view
 from diffrast.edges.records import Records, Start
 
 ROWS_AT_ONCE = 1024
@@ -37,11 +36,10 @@ def _over_rows(
     count = jnp.where(applies, jnp.minimum(records.total - records.row, capacity), 0)
 
     def step(n: Array, total: Any) -> Any:
-        first = begin = n * at_once
-        if capacity % at_once:  # the last block begins among the rows of the one before
-            begin = jnp.minimum(first, capacity - at_once)
+        first = n * at_once
+        begin = jnp.minimum(first, capacity - at_once)  # the last block among the rows before
         number = begin + jnp.arange(at_once)
-        used = number < count if begin is first else (number >= first) & (number < count)
+        used = (number >= first) & (number < count)
         rows = [lax.dynamic_slice_in_dim(column, begin, at_once) for column in records.columns]
         return add(used, rows, total)
 
@@ -59,6 +57,7 @@ def _over_pieces(
 
     The pieces that are not recorded are found again, as many at a time as there are rows.
     """
+    at_once = method.lanes * ROWS_AT_ONCE
 
     def step(state: tuple[Array, Start, Any]) -> tuple[Array, Start, Any]:
         which, start, total = state
@@ -75,7 +74,6 @@ def _over_pieces(
     def is_left(state: tuple[Array, Start, Any]) -> Array:
         return state[0] < len(adds)
 
-    at_once = method.lanes * ROWS_AT_ONCE
     total = _over_rows(records, at_once, adds[0], total)
     which = jnp.where(records.following.row < records.total, 0, len(adds))
     total = lax.while_loop(is_left, step, (which, records.following, total))[2]
@@ -173,20 +171,16 @@ def apply_linear(
     each: derivatives of it and of its transpose, again, leave out none.
     """
 
-    def each_view(apply: Callable[..., Any]) -> Callable[..., Any]:
-        def in_lanes(lanes: int) -> Callable[..., Any]:
-            return lambda view, *rest: apply(view, method._replace(lanes=lanes), *rest)
-
-        return over_views(in_lanes, rims.size)
-
     def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         return x
 
     def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        return b[0], b[1], each_view(_push)(view, records, rims, *b)
+        push = each_view(_push, method, rims.size)
+        return b[0], b[1], push(view, records, rims, *b)
 
     def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        return *each_view(_pull)(view, records, rims, b[2]), b[2]
+        pull = each_view(_pull, method, rims.size)
+        return *pull(view, records, rims, b[2]), b[2]
 
     nothing = jnp.zeros_like(cropped(colors, view.image.shape)).at[0, 0].add(0 * points[0, 0])
     right = points, colors, nothing

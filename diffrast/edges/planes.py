@@ -71,6 +71,13 @@ def edge_values(
     return values, stored(depth)
 
 
+def lowest(values: Columns) -> tuple[Array, Int[Array, "*n"]]:
+    """The lowest of three values, and which one it is, 0 to 2: the first of equal ones."""
+    least = jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
+    which = jnp.where(values[0] == least, 0, jnp.where(values[1] == least, 1, 2))
+    return least, which.astype(jnp.int32)
+
+
 def edge_functions(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
     """Three values of one sign inside of faces, and the volume det(x, y, w), which has that sign.
 

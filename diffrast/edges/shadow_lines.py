@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import first_row
+from diffrast.edges.neighborhood import first_row, steps_to
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
@@ -51,10 +51,6 @@ _BELOW = [(1, 3 * row + k, 3 * row + k + 3) for row, k in itertools.product(rang
 _DIRECTION, _FIRST, _SECOND = np.array(
     sorted(_RIGHT + _BELOW, key=lambda pair: 4 not in pair[1:]), np.int32
 ).T
-
-
-# Of the 3×3 pixels, from the middle one's: x and y.
-_CENTRES = np.stack([np.arange(9) % 3 - 1, np.arange(9) // 3 - 1]).astype(np.float32)
 
 
 class Cast(NamedTuple):
@@ -183,7 +179,7 @@ def cross_shadows(
     lit_on_right = second_on_right != cast.lit[light, row, column]
     # Of an edge that hides something else the line passes elsewhere.
     sides = (
-        _dot(normal, jnp.asarray(_CENTRES)[:, look][..., None] - foot) for look in (_FIRST, _SECOND)
+        _dot(normal, steps_to(jnp.asarray(look))[..., None] - foot) for look in (_FIRST, _SECOND)
     )
     one, other = sides
     apart = jnp.abs(one + other) <= (1 + _BESIDE) * jnp.abs(one - other)
@@ -204,7 +200,7 @@ def cross_shadows(
     # Outlines that are not linked end at each other: those of several shadows where all of them let
     # the light pass, at the corner of one shadow where the other one does not.
     lit, counts = _lit_round(places, own, cast, face_image)
-    told = _dot(outwards, jnp.asarray(_CENTRES)[..., None, None]) > beyond
+    told = _dot(outwards, steps_to(jnp.arange(9))[..., None, None]) > beyond
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
     wrong = [jnp.sum((one != lit) & counts, axis=0) for one in (both, either)]
@@ -348,8 +344,7 @@ def _lit_round(
     places: Places, own: Array, cast: Cast, face_image: Array
 ) -> tuple[Bool[Array, "9 n"], Bool[Array, "9 n"]]:
     """Which of the 3×3 pixels round pixels are lit, and which show the same surface, shone on."""
-    nine = jnp.arange(9)[:, None]
-    row, column = places.pixel[1] + nine // 3, places.pixel[0] + nine % 3
+    column, row = places.pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
     face = stored(face_image[row, column])
     seen = jnp.maximum(face, 0)
     same = (face >= 0) & (cast.patches[seen] == cast.patches[jnp.maximum(own, 0)])

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, Shaped
 
 from diffrast._stored import stored
-from diffrast.edges.planes import cross_rows
+from diffrast.edges.planes import cross_rows, lowest
 from diffrast.geometry import Geometry
 from diffrast.light import dot_columns
 from diffrast.shadows.maps import Pictures
@@ -134,9 +134,8 @@ def cut_by(line: Line, corners: Float[Array, "3 3 *n"]) -> Cut:
     along, sides, distance, rounding = stored((along, sides, distance, rounding))
     sign = jnp.where(along < 0, -1, 1)
     values = [sign * side for side in sides]
-    least = jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
+    least, corner = lowest(values)
     outside = least < 0
-    corner = jnp.where(values[0] == least, 0, jnp.where(values[1] == least, 1, 2))
     before = sign * distance
     before = jnp.where(line.endless, before, jnp.minimum(before, sign * along - before))
     stops = jnp.where((along != 0) & ~outside, before - rounding, -1)

@@ -21,7 +21,7 @@ from diffrast._selection import over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked
-from diffrast.edges.planes import edge_functions
+from diffrast.edges.planes import edge_functions, lowest
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution
@@ -220,9 +220,7 @@ def _leaves(
     for a, b in zip(first, last, strict=True):
         a, b = jnp.maximum(a * sign, 0), b * sign
         parts.append(jnp.where(b < 0, a / jnp.where(b < 0, a - b, 1), 3))
-    part = jnp.minimum(jnp.minimum(parts[0], parts[1]), parts[2])
-    corner = jnp.where(parts[0] == part, 0, jnp.where(parts[1] == part, 1, 2))
-    return stored((part, corner.astype(jnp.int32), volume))
+    return stored((*lowest(parts), volume))
 
 
 def _covering(
@@ -239,10 +237,8 @@ def _covering(
         values, volume = edge_functions(corners_of(there), *end)
         sign = jnp.sign(volume)
         goes = goes & (there >= 0) & ((turn == 0) | (sign == turn))
-        inside = [value * sign for value in values]
-        least = jnp.minimum(jnp.minimum(inside[0], inside[1]), inside[2])
+        least, corner = lowest([value * sign for value in values])
         arrives = goes & (least >= 0)
-        corner = jnp.where(inside[0] == least, 0, jnp.where(inside[1] == least, 1, 2))
         following = neighbors[jnp.maximum(there, 0), corner]
         goes_on = goes & ~arrives
         found = jnp.where(arrives, there, found)
