@@ -36,10 +36,11 @@ def _over_rows(
     count = jnp.where(applies, jnp.minimum(records.total - records.row, capacity), 0)
 
     def step(n: Array, total: Any) -> Any:
-        first = n * at_once
-        begin = jnp.minimum(first, capacity - at_once)  # the last block among the rows before
+        first = begin = n * at_once
+        if capacity % at_once:  # the last block begins among the rows of the one before
+            begin = jnp.minimum(first, capacity - at_once)
         number = begin + jnp.arange(at_once)
-        used = (number >= first) & (number < count)
+        used = number < count if begin is first else (number >= first) & (number < count)
         rows = [lax.dynamic_slice_in_dim(column, begin, at_once) for column in records.columns]
         return add(used, rows, total)
 
