@@ -155,6 +155,21 @@ def test_lit_points_equal_rays_cast_in_float64(name):
     assert not got[~seen].any()
 
 
+@pytest.mark.parametrize(("faces", "resolution"), [(96, 128), (160, 256)])
+def test_stairs_as_steep_as_the_light_do_not_shade_themselves(faces, resolution):
+    """Whose steps are as wide as texels: these do not show how steep it is between them."""
+    steps = np.cumsum(np.arange(faces) % 3 == 2)
+    heights = np.broadcast_to(-3.2 / faces * steps, (faces, faces))
+    scene = dr.Scene(
+        objects=[floor(shapes.height_field(heights, 4.0, 4.0), 0.0)],
+        lights=[sun((1.0, -1.0, 0.1), resolution=resolution)],
+    )
+    camera = dr.Camera.perspective(eye=(1, 3, 4), target=(0, -0.5, 0), **FRAME)
+    seen, got, want = compare(scene, camera)
+    assert want[seen].mean() > 0.999
+    assert np.array_equal(got[seen], want[seen])
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
 def test_shadows_have_no_scale(scale):
     scene, camera = make("ball")

@@ -43,6 +43,7 @@ _WAYS_AT_ONCE = 256
 _STEPS = 64  # from face to face
 _LOST, _HIDDEN = 1, 2  # fates
 _SMALL = 4.0  # square texels, twice the area of a face
+_CLOSE = 8.0  # behind a smooth surface by less than so many half texels: what is steep between them
 
 
 class _Sight(NamedTuple):
@@ -71,9 +72,11 @@ def lit(
     """1 where a light sees points that are asked for, 0 elsewhere. Not differentiable."""
     texel = texel_of(pictures, rays)
     floor, slope_x, slope_y = _smooth_at(pictures, rays.picture, texel)
-    least = floor + slope_x * texel.x + slope_y * texel.y
-    bright = rays.asked & (rays.key >= least - _rounding(rays))
-    order, count = selected(rays.asked & jnp.isinf(floor))
+    behind = (floor + slope_x * texel.x + slope_y * texel.y) - rays.key
+    constant, per_key = jnp.max(pictures.plan.limit, axis=0)
+    close = rays.asked & (behind < _CLOSE * (constant + per_key * rays.key))
+    smooth = (behind <= _rounding(rays)) & ~jnp.isinf(floor)
+    order, count = selected(close & ~smooth)
     few = 512 * -(-rays.x.size // 4096)  # of few, as edges have
     at_once = min(lanes() * min(_AT_ONCE, few), rays.x.size)
 
@@ -84,7 +87,7 @@ def lit(
         hidden = _hidden(pictures, geometry, neighbors, some, sight, doubt)
         return bright.at[jnp.where(hidden, chosen, bright.size)].set(False, mode="drop")
 
-    return over_batches(order, count, at_once, look_closer, bright).astype(floor.dtype)
+    return over_batches(order, count, at_once, look_closer, close).astype(floor.dtype)
 
 
 def _entries(columns: T, chosen: Int[Array, " n"]) -> T:
