@@ -209,8 +209,9 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     Returns:
         For each light that casts shadows, in the scene's order, the edge between each pixel and the
         one on its right (0) and below it (1), as 3 * face + the corner opposite to it, -1 where
-        there is none; the number of pairs of pixels of one surface that a shadow parts, and the
-        number of those with an edge. None without such lights or without objects.
+        there is none; the number of pairs of pixels of one surface that a shadow parts, not folds
+        of the surface, and the number of those with an edge. None without such lights or without
+        objects.
 
     Raises:
         As `render`.
@@ -229,7 +230,9 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     cast = cast_outlines(world, topology, pixels, reached)
     assert cast is not None
     assert world.shadows is not None
-    return parted(world.shadows, topology, pixels, cast.lit, cast.edge)
+    return parted(
+        scene.lights, world.shadows, geometry, topology, pixels, cast.lit, cast.edge, clip
+    )
 
 
 def _check_kinds(scene: Scene, camera: Camera, settings: RenderSettings) -> None:

@@ -298,6 +298,14 @@ def test_pairs_of_pixels_without_an_outline_are_counted():
     assert dr.shadow_outlines(plain, ROUND_THE_CORNER, settings()) is None
 
 
+@pytest.mark.parametrize("name", ["cubes in the light of a spot", "hills in the evening"])
+def test_nearly_all_outlines_are_found(name):
+    """The border of a spot's cone is none, nor is where a hill turns away from the light."""
+    found = dr.shadow_outlines(*make(name), settings())
+    assert found.pairs > 60
+    assert found.found >= 0.99 * found.pairs
+
+
 def test_batches_equal_single_views():
     scene, camera = make("ball")
     directions = jnp.array([[-0.8, -1.0, 0.3], [0.5, -1.0, -0.2]])

@@ -90,6 +90,15 @@ def receive(
         return _reached(lights, shadows, geometry, points, regards)
 
 
+def shone_on(
+    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, points: Points
+) -> Bool[Array, "lights *size"]:
+    """Whether lights with shadows would reach points if nothing were in between."""
+    casting = [light for light in lights if casts_shadow(light)]
+    regards = _regards(casting, shadows.views, shadows.turned, geometry, points)
+    return jnp.stack([asked for _, asked in regards])
+
+
 def terminators(shadows: Shadows, edges: Edges) -> Bool[Array, " edges"]:
     """Edges between a face that is turned to a light with shadows and one that is not."""
     found = jnp.zeros_like(edges.seam)

@@ -20,11 +20,12 @@ from diffrast._device import in_strides, lanes
 from diffrast._selection import over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import first_row, picked
-from diffrast.edges.planes import edge_functions, lowest
+from diffrast.edges.neighborhood import first_row, picked, walk
+from diffrast.edges.pieces import facing, to_pixels
+from diffrast.edges.planes import Table, edge_functions, lowest
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
-from diffrast.shadows.cast import Shadows, by_resolution
+from diffrast.shadows.cast import Shadows, by_resolution, shone_on
 from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import Rays, face_corners, faces_near, line_of, seen_by_light
 from diffrast.shadows.views import cube_side, sides
@@ -39,7 +40,9 @@ _State = tuple[Array, Array, Array, Array, Array, Array]
 class Parted(NamedTuple):
     """Neighbouring pixels that show one surface, lit at one of them only.
 
-    Left out are those whose dark one faces away from the light: there no shadow falls.
+    Left out are those whose dark one faces away from the light, or lies beyond the cone of a spot,
+    as no shadow falls there; and where no edge is known, those between which the surface folds or
+    turns away from the light, as that is what parts them.
     """
 
     edge: Int[Array, "lights 2 height width"]  # result of `outlines`
@@ -137,21 +140,62 @@ def _pairs(
 
 
 def parted(
+    lights: tuple[Light, ...],
     shadows: Shadows,
+    geometry: Geometry,
     topology: Topology,
     points: Points,
     lit: Bool[Array, "lights height width"],
     edge: Int[Array, "lights 2 height width"],
+    positions_clip: Float[Array, "V 4"],
 ) -> Parted:
     """Count the pairs between which `outlines` looked for edges, and those with one."""
-    visible = jnp.maximum(points.face, 0)
-    shadowed = ~lit & jnp.stack([turned[visible] for turned in shadows.turned])
-    right = shadowed | jnp.roll(shadowed, -1, axis=2)
-    below = shadowed | jnp.roll(shadowed, -1, axis=1)
-    pairs = _pairs(topology, points, lit) & jnp.stack([right, below], axis=1)
+    pixels = to_pixels(positions_clip, *points.face.shape)
+    volume = facing(pixels, geometry.faces)
+    shadowed = ~lit & shone_on(lights, shadows, geometry, points)
+    one_surface = _pairs(topology, points, lit)
+
+    def is_parted(turned: Array, dark: Array, pairs: Array, edges: Array) -> Array:
+        dark = jnp.stack([dark | jnp.roll(dark, -1, axis=1), dark | jnp.roll(dark, -1, axis=0)])
+        pairs = pairs & dark
+        searched = pairs & (edges < 0)
+        volume_lit = jnp.where(turned, volume, 0)
+        joined = _are_joined(points.face, searched, geometry, topology, pixels, volume_lit)
+        return pairs & (joined | (edges >= 0))
+
+    of_lights = zip(shadows.turned, shadowed, one_surface, edge, strict=True)
+    pairs = jnp.stack([is_parted(*of_light) for of_light in of_lights])
     return Parted(
         edge, jnp.sum(pairs, axis=(1, 2, 3)), jnp.sum(pairs & (edge >= 0), axis=(1, 2, 3))
     )
+
+
+def _are_joined(
+    face: Int[Array, "height width"],
+    asked: Bool[Array, "2 height width"],
+    geometry: Geometry,
+    topology: Topology,
+    pixels: Table,
+    volume: Float[Array, " F"],
+) -> Bool[Array, "2 height width"]:
+    """Whether the surface seen at a pixel goes on to the one on its right, and to that below it.
+
+    Over faces that have a `volume`, to where the other pixel's centre shows it.
+    """
+    here = jnp.stack([face, face])
+    there = jnp.stack([jnp.roll(face, -1, axis=1), jnp.roll(face, -1, axis=0)])
+    row, column = jnp.mgrid[: face.shape[0], : face.shape[1]] + 0.5
+    x, y = jnp.stack([column + 1, column]), jnp.stack([row, row + 1])
+    end, _ = walk(
+        jnp.where(asked, here, -1).reshape(1, -1),
+        x.reshape(1, -1),
+        y.reshape(1, -1),
+        geometry.faces,
+        pixels,
+        topology.neighbors,
+        volume,
+    )
+    return asked & (end.reshape(asked.shape) == there)
 
 
 def _edge_between(
