@@ -281,9 +281,11 @@ def _with_edges(
 
 
 @partial(jax.jit, static_argnames="shading")
-def _shade_points(world: World, face: Array, at: Columns, *, shading: str) -> Columns:
+def _shade_points(
+    world: World, face: Array, at: Columns, told: Array | None, *, shading: str
+) -> Columns:
     points = Points(face, at, jnp.zeros_like(at[0]))
-    return SHADERS[shading](world, points, receive_shadows(world, points))
+    return SHADERS[shading](world, points, receive_shadows(world, points, told))
 
 
 @partial(jax.jit, static_argnames="shading")

@@ -126,7 +126,7 @@ def antialias(
 
 
 def _by_columns(shader: PointShader) -> Shader:
-    def shade(data: Any, face: Array, barycentrics: list[Array]) -> list[Array]:
+    def shade(data: Any, face: Array, barycentrics: list[Array], _: Array | None) -> list[Array]:
         colors = shader(data, face, jnp.stack(barycentrics, axis=-1))
         return [colors[:, c] for c in range(colors.shape[1])]
 

@@ -25,13 +25,13 @@ from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
-from diffrast.edges.shadow_lines import Cast, Shadow
+from diffrast.edges.shadow_lines import Cast, Shadow, light_told
 from diffrast.edges.visibility import BACKGROUND, Seen
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 _SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
 
-Shader = Callable[[Any, Array, list[Array]], list[Array]]
+Shader = Callable[[Any, Array, list[Array], Array | None], list[Array]]
 Glow = Callable[[Any, Array, Array, list[Array]], list[Array]]
 
 
@@ -56,8 +56,9 @@ class Method(NamedTuple):
     """How edges are drawn; all static.
 
     Attributes:
-        shader: colours of points on faces, `shader(scene, face, barycentrics)`; None takes the
-            colours of pixels beside the edge instead.
+        shader: colours of points on faces, `shader(scene, face, barycentrics, told)`, with whether
+            lights reach them as `light_told` knows, None without shadows; None takes the colours of
+            pixels beside the edge instead.
         glow: what one light adds to the colours, `glow(scene, light, face, barycentrics)`.
         cull_backfaces: whether only front faces are drawn.
         capacity: rows of the records; 0 for a picture alone, of which nothing is recorded.
@@ -152,17 +153,24 @@ def _colors(image: Array, place: Int[Array, " n"]) -> Float[Array, "channels n"]
 
 
 def _shade(
-    view: View, method: Method, *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]]
+    view: View,
+    method: Method,
+    pixel: Int[Array, "2 n"],
+    *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]],
 ) -> list[Float[Array, "channels n"]]:
     """Colours of points on faces, several of each piece at once."""
     assert method.shader is not None
+    told = None
+    if view.cast is not None:
+        of = [light_told(view.cast, view.face_image, pixel, face) for face, _ in points]
+        told = jnp.concatenate(of, axis=1)
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
     if view.scale is not None:
         scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = assemble(method.shader(view.scene, face, barycentrics), first=True)
+    colors = assemble(method.shader(view.scene, face, barycentrics, told), first=True)
     return jnp.split(colors, len(points), axis=1)
 
 
@@ -193,7 +201,7 @@ def with_pieces(
         value = area * jump
     else:
         points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
-        front, beyond, bend, far, beside = _shade(view, method, *points)
+        front, beyond, bend, far, beside = _shade(view, method, pieces.pixel, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
@@ -231,7 +239,7 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         right, left = stored([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
-        right, left = _shade(view, method, *points)
+        right, left = _shade(view, method, line.pixel, *points)
     jump = stored(right - left)
     value = area * jump
     sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))

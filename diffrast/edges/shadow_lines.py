@@ -39,6 +39,7 @@ from diffrast.edges.planes import (
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
+_CROSS = np.array([1, 3, 4, 5, 7])  # of the 3×3 pixels: the middle one, and the four next to it
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
 _BESIDE = 0.1  # how far beyond pixels a line may pass that parts them, of half their distance
@@ -349,6 +350,29 @@ def _lit_round(
     seen = jnp.maximum(face, 0)
     same = (face >= 0) & (cast.patches[seen] == cast.patches[jnp.maximum(own, 0)])
     return cast.lit[places.light, row, column], same & cast.turned[places.light, seen]
+
+
+@jax.jit
+def light_told(
+    cast: Cast,
+    face_image: Int[Array, "height_with_border width_with_border"],
+    pixel: Int[Array, "2 n"],
+    face: Int[Array, " n"],
+) -> Int[Array, "lights n"]:
+    """Whether lights reach faces at pixels, as far as these and the four next to them tell.
+
+    1 or 0 where all those agree that show the same surface, turned to the light; else -1. Between
+    them no outline is known, so a ray to the light would tell of a strip that no centre shows.
+    """
+    column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(_CROSS))[..., None]
+    shown = stored(face_image[row, column])
+    seen, face = jnp.maximum(shown, 0), jnp.maximum(face, 0)
+    same = (shown >= 0) & (cast.patches[seen] == cast.patches[face])
+    counts = same & cast.turned[:, seen]
+    lit = cast.lit[:, row, column]
+    bright, dark = jnp.any(counts & lit, axis=1), jnp.any(counts & ~lit, axis=1)
+    told = jnp.where(bright == dark, -1, jnp.where(bright, 1, 0))
+    return stored(jnp.where(cast.turned[:, face], told, 0))
 
 
 def _dot(a: Array, b: Array) -> Array:
