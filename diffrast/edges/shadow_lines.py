@@ -39,10 +39,12 @@ from diffrast.edges.planes import (
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
+_CERTAIN = 8
 _CROSS = np.array([1, 3, 4, 5, 7])  # of the 3×3 pixels: the middle one, and the four next to it
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
-_BESIDE = 0.1  # how far beyond pixels a line may pass that parts them, of half their distance
+_BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
+_EDGE_ON = 1e-4
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
@@ -92,6 +94,7 @@ class Outlines(NamedTuple):
     source: Float[Array, "3 n"]  # the light, likewise
     weight: Float[Array, " n"]  # and its h
     lit_on_right: Bool[Array, "12 n"]
+    first_is_lit: Bool[Array, "12 n"]  # of the two neighbours
     centre_is_lit: Bool[Array, " n"]  # in the image
     alone: Bool[Array, " n"]  # whether there is one line only
     range: Float[Array, "2 12 n"]  # begin and end along the line, from the point next to the centre
@@ -176,14 +179,21 @@ def cross_shadows(
     ground = _face_plane(corners[:, :, None])
     shadow = _shadow_plane(source[:, None], weight, *ends)
     normal, foot, inverse = stored(_line(ground, shadow))
+    first_is_lit = cast.lit[light, row, column]
+    # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
+    # light, when the two pixels tell.
+    tip = place(faces[caster, third])
+    above = _dot(shadow.normal, tip) + shadow.offset
+    known = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
     second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
-    lit_on_right = second_on_right != cast.lit[light, row, column]
+    dark_on_right = (above > 0) == (ground.offset > 0)
+    lit_on_right = jnp.where(known, ~dark_on_right, second_on_right != first_is_lit)
     # Of an edge that hides something else the line passes elsewhere.
-    sides = (
+    sides = [
         _dot(normal, steps_to(jnp.asarray(look))[..., None] - foot) for look in (_FIRST, _SECOND)
-    )
-    one, other = sides
-    apart = jnp.abs(one + other) <= (1 + _BESIDE) * jnp.abs(one - other)
+    ]
+    to_first = jnp.where(lit_on_right == first_is_lit, 1, -1)
+    apart = (to_first * sides[0] > -_BESIDE) & (to_first * sides[1] < _BESIDE)
     valid = valid & (inverse > 0) & apart
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
@@ -204,7 +214,8 @@ def cross_shadows(
     told = _dot(outwards, steps_to(jnp.arange(9))[..., None, None]) > beyond
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
-    wrong = [jnp.sum((one != lit) & counts, axis=0) for one in (both, either)]
+    certain = _CERTAIN * (jnp.arange(9)[:, None] == 4) + 1  # the line is drawn for its own face
+    wrong = [jnp.sum(((one != lit) & counts) * certain, axis=0) for one in (both, either)]
     known = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
     chosen = jnp.where(known, valid, chosen)
     ends_others = known & valid[:, None] & valid & (chain[:, None] != chain)
@@ -244,6 +255,7 @@ def cross_shadows(
         source=source,
         weight=weight,
         lit_on_right=lit_on_right,
+        first_is_lit=first_is_lit,
         centre_is_lit=cast.lit[light, pixel[1] + 1, pixel[0] + 1],
         alone=jnp.sum(chosen, axis=0) == 1,
         range=_REACH * (2 * jnp.stack([low, high]) - 1),
@@ -321,9 +333,7 @@ def shadow_of(
 
     # Of the two neighbours between which it passes one is on its right.
     looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
-    step = looks[1] - looks[0]
-    second_on_right = jnp.where(step == 1, normal[0], normal[1]) > 0
-    look = jnp.where(second_on_right, looks[::-1], looks)
+    look = jnp.where(lit_on_right == one(outlines.first_is_lit), looks, looks[::-1])
     return Shadow(
         pixel=pixel,
         light=light,
