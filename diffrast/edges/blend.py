@@ -156,14 +156,19 @@ def _shade(
     view: View,
     method: Method,
     pixel: Int[Array, "2 n"],
+    most: Sequence[Int[Array, " n"]],
     *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]],
 ) -> list[Float[Array, "channels n"]]:
-    """Colours of points on faces, several of each piece at once."""
+    """Colours of points on faces, several of each piece at once.
+
+    Of each point, the `most` that pixels may tell of light: 1, 0 that it is dark, -1 nothing.
+    """
     assert method.shader is not None
     told = None
     if view.cast is not None:
-        of = [light_told(view.cast, view.face_image, pixel, face) for face, _ in points]
-        told = jnp.concatenate(of, axis=1)
+        of = (light_told(view.cast, view.face_image, pixel, face) for face, _ in points)
+        of_each = [jnp.where(one <= limit, one, -1) for limit, one in zip(most, of, strict=True)]
+        told = jnp.concatenate(of_each, axis=1)
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
     if view.scale is not None:
         scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
@@ -201,7 +206,10 @@ def with_pieces(
         value = area * jump
     else:
         points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
-        front, beyond, bend, far, beside = _shade(view, method, pieces.pixel, *points)
+        # What is behind a fold may be in its shadow, which no pixel may show.
+        own, other = (jnp.where(found.fold, most, 1) for most in (-1, 0))
+        most = own, other, own, own, own
+        front, beyond, bend, far, beside = _shade(view, method, pieces.pixel, most, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
@@ -239,7 +247,9 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         right, left = stored([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
-        right, left = _shade(view, method, line.pixel, *points)
+        right, left = _shade(
+            view, method, line.pixel, [jnp.full_like(line.face[0], -1)] * 2, *points
+        )
     jump = stored(right - left)
     value = area * jump
     sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import first_row, steps_to
+from diffrast.edges.neighborhood import first_row, picked, steps_to
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
@@ -34,17 +34,23 @@ from diffrast.edges.planes import (
     barycentrics,
     cross_rows,
     edge_functions,
+    edge_values,
     largest,
 )
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _CERTAIN = 8
-_CROSS = np.array([1, 3, 4, 5, 7])  # of the 3×3 pixels: the middle one, and the four next to it
+_CROSS = np.array(
+    [1, 3, 4, 5, 7], np.int32
+)  # of the 3×3 pixels: the middle one, and the four next to it
+_NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)
+_EDGES = 4  # of a pixel, at most,
+_FACES = 4  # and on so many faces
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
-_EDGE_ON = 1e-4
+_EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
@@ -84,21 +90,23 @@ class Places(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Lines that may part pixels: one for each pair of neighbours, shape (12, n)."""
+    """Lines that may part pixels: of edges on faces."""
 
     places: Places
-    face: Int[Array, " n"]  # on which the shadows fall
-    corners: Float[Array, "3 3 n"]  # of it, from the pixel's centre
-    vertices: Int[Array, "2 12 n"]  # of the edge
-    ends: Float[Array, "2 3 12 n"]  # of the edge, from the pixel's centre
+    face: Int[Array, "faces n"]  # on which the shadows fall
+    corners: Float[Array, "3 3 faces n"]  # of them, from the pixel's centre
+    vertices: Int[Array, "2 edges n"]
+    ends: Float[Array, "2 3 edges n"]  # of the edges, from the pixel's centre
     source: Float[Array, "3 n"]  # the light, likewise
     weight: Float[Array, " n"]  # and its h
-    lit_on_right: Bool[Array, "12 n"]
-    first_is_lit: Bool[Array, "12 n"]  # of the two neighbours
+    lit_on_right: Bool[Array, "edges faces n"]
+    looks: Int[Array, "2 edges n"]  # 0 to 8: two pixels between which it passes
+    first_is_lit: Bool[Array, "edges n"]
     centre_is_lit: Bool[Array, " n"]  # in the image
+    centre_is_turned: Bool[Array, " n"]  # to the light
     alone: Bool[Array, " n"]  # whether there is one line only
-    range: Float[Array, "2 12 n"]  # begin and end along the line, from the point next to the centre
-    lines: Int[Array, " list"]  # row * n + number of the pixel
+    range: Float[Array, "2 edges faces n"]  # begin and end, from the point next to the centre
+    lines: Int[Array, " list"]  # (edge * faces + face) * n + number of the pixel
     total: Int[Array, ""]  # of lines
 
 
@@ -151,7 +159,7 @@ def cross_shadows(
     pixels: Table,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Outlines:
-    """Find the lines at these places."""
+    """Find the lines at these places: of each edge on each face on which its shadow may fall."""
     light, rows, pixel = places
     centre = pixel + 0.5
 
@@ -160,74 +168,93 @@ def cross_shadows(
         x, y, w = pixels[:, vertex]
         return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
 
-    row, column = pixel[1] + _FIRST[:, None] // 3, pixel[0] + _FIRST[:, None] % 3
-    edge = stored(cast.edge[light, _DIRECTION[:, None], row, column])
-    own = stored(face_image[pixel[1] + 1, pixel[0] + 1])
-    next_to = stored(face_image[row, column])
-    patch = cast.patches[jnp.maximum(next_to, 0)] == cast.patches[jnp.maximum(own, 0)]
-    again = jnp.any(edge[:, None] == jnp.where(jnp.tri(12, k=-1)[..., None] > 0, edge, -2), axis=1)
-    shone_on = (own >= 0) & cast.turned[light, jnp.maximum(own, 0)]
-    valid = exists & (edge >= 0) & shone_on & patch & ~again
+    # The faces round the pixel, and those of its surface that are turned to the light.
+    column, row = pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
+    shown = stored(face_image[row, column])
+    seen = jnp.maximum(shown, 0)
+    own, patch = shown[4], stored(cast.patches[seen])
+    same = (shown >= 0) & (patch == patch[4])
+    counts = stored(same & cast.turned[light, seen])
+    lit = stored(cast.lit[light, row, column])
+
+    between = stored(cast.edge[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
+    known = exists & (between >= 0) & same[_FIRST] & same[4]
+    pair, found = _unlike(between, known, _EDGES)
+    edge = jnp.stack([picked(between, k) for k in pair])
+    first, second = jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]
+    which, received = _unlike(shown[_NEAREST], counts[_NEAREST], _FACES)
+    ground_face = jnp.stack([picked(shown[_NEAREST], k) for k in which])
+    is_own = received & (ground_face == own)
 
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
     vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in (1, 2)]))
     ends = [place(vertex) for vertex in vertices]
-    corners = place(faces.T[:, jnp.maximum(own, 0)])
+    corners = place(faces.T[:, jnp.maximum(ground_face, 0)])
     source = place(rows[0])
     weight = cast.weight[light]
 
-    ground = _face_plane(corners[:, :, None])
-    shadow = _shadow_plane(source[:, None], weight, *ends)
-    normal, foot, inverse = stored(_line(ground, shadow))
-    first_is_lit = cast.lit[light, row, column]
-    # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
-    # light, when the two pixels tell.
+    # Of each edge (rows) on each face (columns).
+    ground, shadow = _face_plane(corners), _shadow_plane(source[:, None], weight, *ends)
     tip = place(faces[caster, third])
     above = _dot(shadow.normal, tip) + shadow.offset
-    known = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
-    second_on_right = jnp.where(_DIRECTION[:, None] == 0, normal[0], normal[1]) > 0
-    dark_on_right = (above > 0) == (ground.offset > 0)
-    lit_on_right = jnp.where(known, ~dark_on_right, second_on_right != first_is_lit)
+    ends_of = [_end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
+    ground = _Plane(ground.normal[:, None], ground.offset[None])
+    shadow, *ends_of = (_Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, *ends_of))
+    normal, foot, inverse = stored(_line(ground, shadow))
+    # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
+    # light, when the two pixels tell.
+    tells = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
+    below = second - first == 3
+    second_on_right = jnp.where(below[:, None], normal[1], normal[0]) > 0
+    first_is_lit = jnp.stack([picked(lit, k) for k in first])
+    dark_on_right = (above[:, None] > 0) == (ground.offset > 0)
+    lit_on_right = jnp.where(
+        tells[:, None], ~dark_on_right, second_on_right != first_is_lit[:, None]
+    )
+    outwards = jnp.where(lit_on_right, 1, -1) * normal
+    beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
     # Of an edge that hides something else the line passes elsewhere.
-    sides = [
-        _dot(normal, steps_to(jnp.asarray(look))[..., None] - foot) for look in (_FIRST, _SECOND)
-    ]
-    to_first = jnp.where(lit_on_right == first_is_lit, 1, -1)
-    apart = (to_first * sides[0] > -_BESIDE) & (to_first * sides[1] < _BESIDE)
-    valid = valid & (inverse > 0) & apart
+    to_first, to_second = (
+        _dot(outwards, steps_to(look)[:, :, None]) - beyond for look in (first, second)
+    )
+    inner, outer = (
+        jnp.where(first_is_lit[:, None], *way)
+        for way in ((to_second, to_first), (to_first, to_second))
+    )
+    of_pair = jnp.broadcast_to(is_own, (_EDGES, *is_own.shape))
+    for look in (first, second):
+        of_pair = of_pair | (jnp.stack([picked(shown, k) for k in look])[:, None] == ground_face)
+    passes = (inverse > 0) & (inner < _BESIDE) & (outer > -_BESIDE)
+    valid = found & jnp.any(of_pair & received & passes, axis=1)
+    usable = valid[:, None] & received & (inverse > 0)
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
     linked = meets[0] | meets[1]
-    primary = valid & (jnp.arange(12)[:, None] == first_row(valid))
+    primary = valid & (jnp.arange(_EDGES)[:, None] == first_row(valid))
     chain = primary
     for _ in range(2):
         chain = chain | jnp.any(linked & chain, axis=1)
-    outwards = jnp.where(lit_on_right, 1, -1) * normal
-    beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
-    first = jnp.sum(jnp.where(primary, outwards, 0), axis=1)
-    chosen = chain | (valid & (_dot(outwards, first[:, None]) < _OPPOSITE))
+    along_first = jnp.sum(jnp.where(primary, outwards[:, :, 0], 0), axis=1)
+    chosen = chain | (valid & (_dot(outwards[:, :, 0], along_first[:, None]) < _OPPOSITE))
 
     # Outlines that are not linked end at each other: those of several shadows where all of them let
     # the light pass, at the corner of one shadow where the other one does not.
-    lit, counts = _lit_round(places, own, cast, face_image)
-    told = _dot(outwards, steps_to(jnp.arange(9))[..., None, None]) > beyond
+    told = _dot(outwards[:, None, :, 0], steps_to(jnp.arange(9))[..., None, None]) > beyond[:, 0]
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
-    certain = _CERTAIN * (jnp.arange(9)[:, None] == 4) + 1  # the line is drawn for its own face
+    certain = jnp.where((jnp.arange(9)[:, None] == 4) & is_own[0], _CERTAIN, 1)
     wrong = [jnp.sum(((one != lit) & counts) * certain, axis=0) for one in (both, either)]
-    known = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
-    chosen = jnp.where(known, valid, chosen)
-    ends_others = known & valid[:, None] & valid & (chain[:, None] != chain)
+    decided = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
+    chosen = jnp.where(decided, valid, chosen)
+    ends_others = decided & valid[:, None] & valid & (chain[:, None] != chain)
     side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
     sign = jnp.where(ground.offset < 0, -1, 1)
-    limits = [
-        sign * _meet(ground, _end_plane(source[:, None], weight, shadow, *way))
-        for way in (ends, ends[::-1])
-    ]
-    cut = [jnp.any(meet & chosen, axis=1) for meet in meets]
+    limits = [sign * _meet(ground, plane) for plane in ends_of]
+    cut = [jnp.any(meet & chosen, axis=1)[:, None] for meet in meets]
+    borders = _shared(faces, ground_face, received, is_own)
 
     def inside(at: Array) -> list[Array]:
         x, y = at
@@ -236,32 +263,65 @@ def cross_shadows(
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
         ]
-        distance = [side * (outwards[0, k] * x + outwards[1, k] * y - beyond[k]) for k in range(12)]
-        return (
-            square
-            + ends_here
-            + [jnp.where(ends_others[:, k], d, 1) for k, d in enumerate(distance)]
-        )
+        others = [
+            jnp.where(ends_others[:, k, None], side * (way[0] * x + way[1] * y - least), 1)
+            for k, (way, least) in enumerate(zip(outwards.swapaxes(0, 1), beyond, strict=True))
+        ]
+        values, _ = edge_values(corners[:, :, None], x, y, near=(zero, zero))
+        on_face = [jnp.where(ends, v, 1) for ends, v in zip(borders, values, strict=True)]
+        return square + ends_here + others + on_face
 
+    zero = jnp.zeros_like(source[0])
     low, high = positive_part(inside(foot - along), inside(foot + along))
-    chosen = chosen & (low < high)
-    lines, total = selected(chosen.reshape(-1))
+    drawn = (chosen[:, None] & usable & (low < high)).reshape(_EDGES * _FACES, -1)
+    lines, total = selected(drawn.reshape(-1))
     return Outlines(
         places=places,
-        face=own,
+        face=ground_face,
         corners=corners,
         vertices=vertices,
         ends=jnp.stack(ends),
         source=source,
         weight=weight,
         lit_on_right=lit_on_right,
+        looks=jnp.stack([first, second]),
         first_is_lit=first_is_lit,
-        centre_is_lit=cast.lit[light, pixel[1] + 1, pixel[0] + 1],
-        alone=jnp.sum(chosen, axis=0) == 1,
+        centre_is_lit=lit[4],
+        centre_is_turned=counts[4],
+        alone=jnp.sum(drawn, axis=0) == 1,
         range=_REACH * (2 * jnp.stack([low, high]) - 1),
         lines=lines,
         total=total,
     )
+
+
+def _unlike(values: Array, used: Array, count: int) -> tuple[Int[Array, "count n"], Array]:
+    """Rows of the first values that are used and unlike each other, and whether there are so many.
+
+    Rows that are not there are the first.
+    """
+    before = jnp.tri(values.shape[0], k=-1, dtype=bool)[..., None]
+    again = jnp.any(before & (values[:, None] == values) & used, axis=1)
+    new = used & ~again
+    number = jnp.where(new, jnp.cumsum(new, axis=0) - 1, -1)
+    rows = jnp.stack([first_row(number == k) for k in range(count)])
+    return stored((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
+
+
+def _shared(faces: Array, face: Array, exists: Array, is_own: Array) -> list[Array]:
+    """Beyond which of three edges of faces the shadow falls on another one of these.
+
+    Beyond each, but for the pixel's own face, which stands for those that are not known.
+    """
+    corners = stored(faces.T[:, jnp.maximum(face, 0)])  # (3, rows, n)
+    other = exists & ~is_own
+    has = jnp.any(corners[:, None, :, None] == corners[None, :, None], axis=1) & other
+    count = face.shape[0]
+    has = has & ~jnp.eye(count, dtype=bool)[..., None]  # (3, rows, other rows, n)
+    return [
+        jnp.where(is_own, jnp.any(has[(k + 1) % 3] & has[(k + 2) % 3], axis=1), True)
+        for k in range(3)
+    ]
 
 
 @jax.jit
@@ -272,25 +332,24 @@ def shadow_of(
     faces: Int[Array, "F 3"],
 ) -> Shadow:
     """These lines, and how they move."""
-    row, place = line // outlines.face.size, line % outlines.face.size
+    row, place = jnp.divmod(line, outlines.weight.size)
+    edge, column = row // _FACES, row % _FACES
+
+    def of_edge(values: Array) -> Array:
+        return values[..., edge, place]
 
     def one(values: Array) -> Array:
-        return values[..., row, place]
+        return values[..., edge, column, place]
 
-    (light, rows_of_light, pixel), face, corners, source, weight = stored(
+    (light, rows_of_light, pixel), source, weight = stored(
         jax.tree.map(
             lambda values: values[..., place],
-            (
-                outlines.places,
-                outlines.face,
-                outlines.corners,
-                outlines.source,
-                outlines.weight,
-            ),
+            (outlines.places, outlines.source, outlines.weight),
         )
     )
+    face, corners = stored((outlines.face[column, place], outlines.corners[..., column, place]))
     centre_is_lit, alone = outlines.centre_is_lit[place], outlines.alone[place]
-    start, end = stored((one(outlines.ends[0]), one(outlines.ends[1])))
+    start, end = stored((of_edge(outlines.ends[0]), of_edge(outlines.ends[1])))
     ground, shadow = _face_plane(corners), _shadow_plane(source, weight, start, end)
     normal, foot, inverse = _line(ground, shadow)
     along = jnp.stack([-normal[1], normal[0]])
@@ -301,6 +360,7 @@ def shadow_of(
     centre_on_right = from_centre < 0
     # Where the centre's side is not what the image has, rounding has moved it over the line; or
     # what the line bounds is dark or lit for another reason.
+    alone = alone & outlines.centre_is_turned[place]
     wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
     near = jnp.abs(from_centre) < _ROUNDED
 
@@ -329,11 +389,11 @@ def shadow_of(
     of_weight = jnp.zeros_like(of_pairs[0]).at[2].set(weight_motion)
     motion = jnp.stack([*of_pairs, of_weight])
     lamp, its_weight = rows_of_light
-    vertices = [*one(outlines.vertices), *faces[face].T, lamp, its_weight, its_weight]
+    vertices = [*of_edge(outlines.vertices), *faces[face].T, lamp, its_weight, its_weight]
 
     # Of the two neighbours between which it passes one is on its right.
-    looks = jnp.stack([jnp.asarray(_FIRST)[row], jnp.asarray(_SECOND)[row]])
-    look = jnp.where(lit_on_right == one(outlines.first_is_lit), looks, looks[::-1])
+    looks = of_edge(outlines.looks)
+    look = jnp.where(lit_on_right == of_edge(outlines.first_is_lit), looks, looks[::-1])
     return Shadow(
         pixel=pixel,
         light=light,
@@ -349,17 +409,6 @@ def shadow_of(
         vertices=jnp.stack(vertices).reshape(4, 2, -1),
         motion=jnp.where(exists, motion, 0),
     )
-
-
-def _lit_round(
-    places: Places, own: Array, cast: Cast, face_image: Array
-) -> tuple[Bool[Array, "9 n"], Bool[Array, "9 n"]]:
-    """Which of the 3×3 pixels round pixels are lit, and which show the same surface, shone on."""
-    column, row = places.pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
-    face = stored(face_image[row, column])
-    seen = jnp.maximum(face, 0)
-    same = (face >= 0) & (cast.patches[seen] == cast.patches[jnp.maximum(own, 0)])
-    return cast.lit[places.light, row, column], same & cast.turned[places.light, seen]
 
 
 @jax.jit
@@ -448,6 +497,6 @@ def _line(ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
 
 
 def _same_place(end: Array, others: list[Array]) -> Array:
-    """Which ends (3, 12, n) are where others are, shape (12, 12, n); but for their own edges'."""
+    """Which ends (3, edges, n) are where others are, shape (edges, edges, n); not their own."""
     same = [jnp.all(end[:, :, None] == other[:, None], axis=0) for other in others]
-    return (same[0] | same[1]) & (jnp.eye(12)[..., None] == 0)
+    return (same[0] | same[1]) & ~jnp.eye(end.shape[1], dtype=bool)[..., None]
