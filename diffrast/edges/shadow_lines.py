@@ -1,8 +1,9 @@
 """Outlines of shadows: lines along which a light's shadow planes meet the faces that are seen.
 
 A light and an edge span a plane, and where it meets the plane of a face the shadow of the edge
-falls on that face: along a straight line on the screen. It is cut to one pixel and, at a corner of
-the outline, where the next line begins; then it parts areas as an edge of a mesh does.
+falls on that face: along a straight line on the screen. It is drawn on each face that is seen at
+the pixels round one, and cut to that pixel, to the face and, at a corner of the outline, where the
+next line begins; then it parts areas as an edge of a mesh does.
 
 With h the weight of points, 1 for places and 0 for directions, (x, y, w, h) are coordinates of
 space for a perspective camera, which drops h. For a parallel projection h is the weight that tells
