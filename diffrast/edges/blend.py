@@ -155,20 +155,11 @@ def _colors(image: Array, place: Int[Array, " n"]) -> Float[Array, "channels n"]
 def _shade(
     view: View,
     method: Method,
-    pixel: Int[Array, "2 n"],
-    most: Sequence[Int[Array, " n"]],
+    told: Int[Array, "lights points"] | None,
     *points: tuple[Int[Array, " n"], list[Float[Array, " n"]]],
 ) -> list[Float[Array, "channels n"]]:
-    """Colours of points on faces, several of each piece at once.
-
-    Of each point, the `most` that pixels may tell of light: 1, 0 that it is dark, -1 nothing.
-    """
+    """Colours of points on faces, several of each piece at once."""
     assert method.shader is not None
-    told = None
-    if view.cast is not None:
-        of = (light_told(view.cast, view.face_image, pixel, face) for face, _ in points)
-        of_each = [jnp.where(one <= limit, one, -1) for limit, one in zip(most, of, strict=True)]
-        told = jnp.concatenate(of_each, axis=1)
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
     if view.scale is not None:
         scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
@@ -177,6 +168,25 @@ def _shade(
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
     colors = assemble(method.shader(view.scene, face, barycentrics, told), first=True)
     return jnp.split(colors, len(points), axis=1)
+
+
+def _told(
+    view: View, pixel: Int[Array, "2 n"], found: Seen, points: int
+) -> Int[Array, "lights points"] | None:
+    """What pixels tell of the light in front and beyond, the first of each piece's points.
+
+    Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
+    only that it is dark beyond.
+    """
+    if view.cast is None:
+        return None
+    front, beyond = (
+        light_told(view.cast, view.face_image, pixel, side.face)
+        for side in (found.front, found.beyond)
+    )
+    front = jnp.where(found.fold, -1, front)
+    beyond = jnp.where(found.fold & (beyond > 0), -1, beyond)
+    return jnp.concatenate([front, beyond] + [jnp.full_like(front, -1)] * (points - 2), axis=1)
 
 
 def with_pieces(
@@ -206,10 +216,8 @@ def with_pieces(
         value = area * jump
     else:
         points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
-        # What is behind a fold may be in its shadow, which no pixel may show.
-        own, other = (jnp.where(found.fold, most, 1) for most in (-1, 0))
-        most = own, other, own, own, own
-        front, beyond, bend, far, beside = _shade(view, method, pieces.pixel, most, *points)
+        told = _told(view, pieces.pixel, found, len(points))
+        front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
@@ -247,9 +255,7 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         right, left = stored([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
-        right, left = _shade(
-            view, method, line.pixel, [jnp.full_like(line.face[0], -1)] * 2, *points
-        )
+        right, left = _shade(view, method, None, *points)
     jump = stored(right - left)
     value = area * jump
     sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))

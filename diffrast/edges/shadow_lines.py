@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import first_row, picked, steps_to
+from diffrast.edges.neighborhood import first_row, picked, pixels_round, steps_to
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
@@ -41,13 +41,11 @@ from diffrast.edges.planes import (
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
-_CERTAIN = 8
-_CROSS = np.array(
-    [1, 3, 4, 5, 7], np.int32
-)  # of the 3×3 pixels: the middle one, and the four next to it
-_NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)
-_EDGES = 4  # of a pixel, at most,
-_FACES = 4  # and on so many faces
+_NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
+_CROSS = _NEAREST[:5]  # and of them the middle one, and the four next to it
+_CERTAIN = 8  # times as much as another one tells the middle one where outlines end
+_EDGES = 4  # whose shadows part a pixel, at most,
+_FACES = 4  # on so many faces
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _ROUNDINGS = 64  # in a line's coefficients
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
@@ -101,11 +99,9 @@ class Outlines(NamedTuple):
     source: Float[Array, "3 n"]  # the light, likewise
     weight: Float[Array, " n"]  # and its h
     lit_on_right: Bool[Array, "edges faces n"]
-    looks: Int[Array, "2 edges n"]  # 0 to 8: two pixels between which it passes
-    first_is_lit: Bool[Array, "edges n"]
+    looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
     centre_is_lit: Bool[Array, " n"]  # in the image
-    centre_is_turned: Bool[Array, " n"]  # to the light
-    alone: Bool[Array, " n"]  # whether there is one line only
+    alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light
     range: Float[Array, "2 edges faces n"]  # begin and end, from the point next to the centre
     lines: Int[Array, " list"]  # (edge * faces + face) * n + number of the pixel
     total: Int[Array, ""]  # of lines
@@ -171,7 +167,7 @@ def cross_shadows(
 
     # The faces round the pixel, and those of its surface that are turned to the light.
     column, row = pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
-    shown = stored(face_image[row, column])
+    shown = stored(pixels_round(face_image, *pixel))
     seen = jnp.maximum(shown, 0)
     own, patch = shown[4], stored(cast.patches[seen])
     same = (shown >= 0) & (patch == patch[4])
@@ -182,7 +178,9 @@ def cross_shadows(
     known = exists & (between >= 0) & same[_FIRST] & same[4]
     pair, found = _unlike(between, known, _EDGES)
     edge = jnp.stack([picked(between, k) for k in pair])
-    first, second = jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]
+    looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
+    first_is_lit = jnp.stack([picked(lit, k) for k in looks[0]])
+    looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
     which, received = _unlike(shown[_NEAREST], counts[_NEAREST], _FACES)
     ground_face = jnp.stack([picked(shown[_NEAREST], k) for k in which])
     is_own = received & (ground_face == own)
@@ -205,27 +203,17 @@ def cross_shadows(
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
     tells = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
-    below = second - first == 3
-    second_on_right = jnp.where(below[:, None], normal[1], normal[0]) > 0
-    first_is_lit = jnp.stack([picked(lit, k) for k in first])
     dark_on_right = (above[:, None] > 0) == (ground.offset > 0)
-    lit_on_right = jnp.where(
-        tells[:, None], ~dark_on_right, second_on_right != first_is_lit[:, None]
-    )
+    to_lit = (steps_to(lit_look) - steps_to(dark_look))[:, :, None]
+    lit_on_right = jnp.where(tells[:, None], ~dark_on_right, _dot(normal, to_lit) > 0)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
     beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
     # Of an edge that hides something else the line passes elsewhere.
-    to_first, to_second = (
-        _dot(outwards, steps_to(look)[:, :, None]) - beyond for look in (first, second)
-    )
-    inner, outer = (
-        jnp.where(first_is_lit[:, None], *way)
-        for way in ((to_second, to_first), (to_first, to_second))
-    )
-    of_pair = jnp.broadcast_to(is_own, (_EDGES, *is_own.shape))
-    for look in (first, second):
-        of_pair = of_pair | (jnp.stack([picked(shown, k) for k in look])[:, None] == ground_face)
+    outer, inner = (_dot(outwards, steps_to(look)[:, :, None]) - beyond for look in looks)
     passes = (inverse > 0) & (inner < _BESIDE) & (outer > -_BESIDE)
+    of_pair = jnp.broadcast_to(is_own, passes.shape)
+    for look in looks:
+        of_pair = of_pair | (jnp.stack([picked(shown, k) for k in look])[:, None] == ground_face)
     valid = found & jnp.any(of_pair & received & passes, axis=1)
     usable = valid[:, None] & received & (inverse > 0)
 
@@ -269,7 +257,7 @@ def cross_shadows(
             for k, (way, least) in enumerate(zip(outwards.swapaxes(0, 1), beyond, strict=True))
         ]
         values, _ = edge_values(corners[:, :, None], x, y, near=(zero, zero))
-        on_face = [jnp.where(ends, v, 1) for ends, v in zip(borders, values, strict=True)]
+        on_face = [jnp.where(*part, 1) for part in zip(borders, values, strict=True)]
         return square + ends_here + others + on_face
 
     zero = jnp.zeros_like(source[0])
@@ -285,11 +273,9 @@ def cross_shadows(
         source=source,
         weight=weight,
         lit_on_right=lit_on_right,
-        looks=jnp.stack([first, second]),
-        first_is_lit=first_is_lit,
+        looks=looks,
         centre_is_lit=lit[4],
-        centre_is_turned=counts[4],
-        alone=jnp.sum(drawn, axis=0) == 1,
+        alone=counts[4] & (jnp.sum(drawn, axis=0) == 1),
         range=_REACH * (2 * jnp.stack([low, high]) - 1),
         lines=lines,
         total=total,
@@ -319,10 +305,7 @@ def _shared(faces: Array, face: Array, exists: Array, is_own: Array) -> list[Arr
     has = jnp.any(corners[:, None, :, None] == corners[None, :, None], axis=1) & other
     count = face.shape[0]
     has = has & ~jnp.eye(count, dtype=bool)[..., None]  # (3, rows, other rows, n)
-    return [
-        jnp.where(is_own, jnp.any(has[(k + 1) % 3] & has[(k + 2) % 3], axis=1), True)
-        for k in range(3)
-    ]
+    return [~is_own | jnp.any(has[(k + 1) % 3] & has[(k + 2) % 3], axis=1) for k in range(3)]
 
 
 @jax.jit
@@ -361,7 +344,6 @@ def shadow_of(
     centre_on_right = from_centre < 0
     # Where the centre's side is not what the image has, rounding has moved it over the line; or
     # what the line bounds is dark or lit for another reason.
-    alone = alone & outlines.centre_is_turned[place]
     wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
     near = jnp.abs(from_centre) < _ROUNDED
 
@@ -392,16 +374,14 @@ def shadow_of(
     lamp, its_weight = rows_of_light
     vertices = [*of_edge(outlines.vertices), *faces[face].T, lamp, its_weight, its_weight]
 
-    # Of the two neighbours between which it passes one is on its right.
     looks = of_edge(outlines.looks)
-    look = jnp.where(lit_on_right == of_edge(outlines.first_is_lit), looks, looks[::-1])
     return Shadow(
         pixel=pixel,
         light=light,
         used=exists & (near | ~wrong_side),
         face=face,
         barycentrics=barycentrics(e),
-        look=look,
+        look=jnp.where(lit_on_right, looks, looks[::-1]),
         lit_on_right=lit_on_right,
         centre_is_lit=centre_is_lit,
         wrong_side=wrong_side,

@@ -2,9 +2,9 @@
 
 Every texel holds the nearest face and its depth key. Where the keys of the 3×3 texels round one lie
 on one smooth surface (their second differences are smaller than half a texel's width), what is near
-that surface is in the light and what is behind it is not, without a look at any face. So each texel
-also holds the slopes of the keys, and its key less the largest of those differences, which is the
-error of extrapolation from the texel's centre: minus infinity where the surface is not smooth.
+that surface is in the light and what is far behind it is not, without a look at any face. So each
+texel also holds the slopes of the keys, and its key less the largest of those differences, which is
+the error of extrapolation from the texel's centre: minus infinity where the surface is not smooth.
 """
 
 from typing import NamedTuple

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from diffrast._device import in_strides, lanes
 from diffrast._selection import over_batches, selected
@@ -156,8 +156,7 @@ def parted(
     one_surface = _pairs(topology, points, lit)
 
     def is_parted(turned: Array, dark: Array, pairs: Array, edges: Array) -> Array:
-        dark = jnp.stack([dark | jnp.roll(dark, -1, axis=1), dark | jnp.roll(dark, -1, axis=0)])
-        pairs = pairs & dark
+        pairs = pairs & (dark | _next_to(dark))
         searched = pairs & (edges < 0)
         volume_lit = jnp.where(turned, volume, 0)
         joined = _are_joined(points.face, searched, geometry, topology, pixels, volume_lit)
@@ -182,12 +181,10 @@ def _are_joined(
 
     Over faces that have a `volume`, to where the other pixel's centre shows it.
     """
-    here = jnp.stack([face, face])
-    there = jnp.stack([jnp.roll(face, -1, axis=1), jnp.roll(face, -1, axis=0)])
     row, column = jnp.mgrid[: face.shape[0], : face.shape[1]] + 0.5
     x, y = jnp.stack([column + 1, column]), jnp.stack([row, row + 1])
     end, _ = walk(
-        jnp.where(asked, here, -1).reshape(1, -1),
+        jnp.where(asked, face, -1).reshape(1, -1),
         x.reshape(1, -1),
         y.reshape(1, -1),
         geometry.faces,
@@ -195,7 +192,12 @@ def _are_joined(
         topology.neighbors,
         volume,
     )
-    return asked & (end.reshape(asked.shape) == there)
+    return asked & (end.reshape(asked.shape) == _next_to(face))
+
+
+def _next_to(values: Shaped[Array, "height width"]) -> Shaped[Array, "2 height width"]:
+    """What the pixels on the right of each and below it hold; of the last ones, the first do."""
+    return jnp.stack([jnp.roll(values, -1, axis=1), jnp.roll(values, -1, axis=0)])
 
 
 def _edge_between(
