@@ -71,7 +71,7 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
     covered = check(clip, mesh.faces, fragments) * size**2
     vertices, faces, pixels = mesh.vertices.shape[0], mesh.faces.shape[0], float(size**2)
     tested = overdraw(clip, mesh.faces) * pixels
-    shadows, _ = jax.jit(cast)(scene.lights, geometry, points)
+    shadows, _ = jax.jit(cast)(scene.lights, geometry, mesh.topology.neighbors, points)
     map_clip = dr.world_to_clip(camera, mesh.vertices)
 
     def see(p: jax.Array, face: jax.Array, attributes: tuple[jax.Array, ...]) -> Any:
