@@ -25,9 +25,6 @@ from diffrast.edges.blend import (
 )
 from diffrast.edges.neighborhood import blocks_with_background
 from diffrast.edges.pieces import (
-    CUT_AT_ONCE,
-    EDGES_AT_ONCE,
-    PIECES_AT_ONCE,
     Waiting,
     behind,
     choose_edges,
@@ -39,6 +36,7 @@ from diffrast.edges.pieces import (
     instead_of_first,
     none_waiting,
     to_pixels,
+    usual_batches,
 )
 from diffrast.edges.piercing import (
     LINES_AT_ONCE,
@@ -137,28 +135,28 @@ def _edges(
     order, count = choose_edges(edges, volume, view.apart)
     z = stored(view.positions_clip[:, 2])
     bare_blocks = blocks_with_background(view.face_image)
-    cut_at_once, pieces_at_once = method.lanes * CUT_AT_ONCE, method.lanes * PIECES_AT_ONCE
+    at_once = usual_batches(view.apart.size, height * width, method.lanes)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
             edge, exists, edges, view.faces, pixels, z, volume, height=height, width=width
         )
         ends = prefix_sum(segments.parts)
-        cuts = batches_of(ends[-1], cut_at_once)
+        cuts = batches_of(ends[-1], at_once.cut)
 
         def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
             n, waiting = state
-            first = n * cut_at_once
-            pieces = cut(segments, ends, first, at_once=cut_at_once, height=height, width=width)
+            first = n * at_once.cut
+            pieces = cut(segments, ends, first, at_once=at_once.cut, height=height, width=width)
             pieces = uncovered(pieces, segments, view.faces, pixels, view.face_image)
             return n + 1, behind(waiting, *gathered(pieces))
 
         def are_few(state: tuple[Array, Waiting]) -> Array:
-            return (state[0] < cuts) & (state[1].total < pieces_at_once)
+            return (state[0] < cuts) & (state[1].total < at_once.pieces)
 
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
-            pieces = first_ones(waiting, pieces_at_once)
+            pieces = first_ones(waiting, at_once.pieces)
             found, left = look(
                 pieces,
                 segments,
@@ -176,10 +174,10 @@ def _edges(
             left = (state[0] < cuts) | (state[1].total > 0)
             return left if goes_on is None else left & goes_on(state[2])
 
-        start = ends[-1] & 0, none_waiting(segments, cut_at_once + pieces_at_once), total
+        start = ends[-1] & 0, none_waiting(segments, at_once.cut + at_once.pieces), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    return Work(order, count, method.lanes * EDGES_AT_ONCE, add_edges)
+    return Work(order, count, at_once.edges, add_edges)
 
 
 def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: Array) -> Work:

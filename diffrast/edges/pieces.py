@@ -9,6 +9,7 @@ from pixel to pixel, and every pixel's part of the line contains its point where
 number one larger: so piece k of a line is found without walking along it, all at once.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -23,12 +24,17 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
-EDGES_AT_ONCE = 4096
-CUT_AT_ONCE = 1024
-PIECES_AT_ONCE = 512
-FEW = 32  # pieces, which are looked at
-PARTS = 16  # in so many parts
+PIECES_AT_ONCE = 256, 512
+PARTS = 16  # in which pieces are looked at where so many of all fill a batch
 _EDGE_ON = 8  # roundings in the volume of a face
+
+
+class AtOnce(NamedTuple):
+    """How many edges are clipped at once, how many pieces cut, and how many looked at."""
+
+    edges: int
+    cut: int
+    pieces: int
 
 
 class Segments(NamedTuple):
@@ -52,6 +58,18 @@ class Pieces(NamedTuple):
     pixel: Int[Array, "2 n"]  # column and row
     range: Float[Array, "2 n"]  # of the piece on the clipped edge, as seen on the screen
     exists: Bool[Array, " n"]
+
+
+def usual_batches(edges: int, pixels: int, lanes: int) -> AtOnce:
+    """Batches of a mesh of so many edges, neither mostly empty nor more than the caches hold.
+
+    An outline has about the square root of the mesh's edges, and is cut at as many borders of
+    pixels. With `lanes` there is room for so many times as much.
+    """
+    usual = 1 << round(math.log2(math.sqrt(edges) + math.sqrt(pixels)))
+    least, most = PIECES_AT_ONCE
+    pieces = lanes * min(max(usual, least), most)
+    return AtOnce(8 * pieces, 2 * pieces, pieces)
 
 
 def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Table:
@@ -290,7 +308,7 @@ def first_ones(waiting: Waiting, at_once: int) -> Pieces:
 
     What hides a piece here and there is found one part after the other.
     """
-    parts = jnp.where(waiting.total <= FEW, PARTS, 1)
+    parts = jnp.where(waiting.total <= at_once // PARTS, PARTS, 1)
     number = jnp.arange(at_once)
     piece, part = number // parts, number % parts
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
