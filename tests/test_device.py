@@ -69,7 +69,7 @@ def test_owners_of_a_million_centres_on_edges():
 def test_views_of_views_and_meshes_of_their_own(monkeypatch):
     """In several chunks of faces, and batches of blocks."""
     monkeypatch.setattr(all_at_once, "_FACES_AT_ONCE", 1000)
-    monkeypatch.setattr(all_at_once, "_BLOCKS_AT_ONCE", 256)
+    monkeypatch.setattr(all_at_once, "_PIXELS_AT_ONCE", 256 * 16)
     scenes = [clip_of(name) for name in ("teapot", "soup round the eye", "parallel soup", "hills")]
     positions, faces = (jnp.stack(column) for column in zip(*scenes, strict=True))
     one = partial(draw_at_once, height=24, width=40, cull_backfaces=False)

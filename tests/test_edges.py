@@ -21,6 +21,7 @@ from diffrast.edges.pieces import (
     facing,
     first_ones,
     to_pixels,
+    usual_batches,
 )
 from diffrast.edges.rim import _border
 
@@ -220,7 +221,7 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
 
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
-    sizes = AtOnce(edges=64, cut=1024, pieces=512)
+    sizes = AtOnce(edges=64, cut=1024, pieces=512, few=32)
     monkeypatch.setattr("diffrast.edges.collect.usual_batches", lambda *_: sizes)
     monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))
@@ -270,8 +271,8 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
 def test_few_pieces_are_looked_at_in_parts():
     """Which follow each other to the bit, as pieces have to that add up to an outline's area."""
     ranges = np.float32([[0.1, 0.25, 0.7], [0.2, 0.6, 0.75]])
-    at_once = 256
-    number = jnp.arange(3 * at_once)
+    at_once = usual_batches(100, 100, 1)
+    number = jnp.arange(at_once.pieces + at_once.cut)
     places = jnp.minimum(number, 2)
     pieces = Pieces(places, jnp.stack([number, number]), jnp.asarray(ranges)[:, places], number < 0)
     few = first_ones(Waiting(pieces, jnp.int32(3)), at_once)
@@ -283,7 +284,7 @@ def test_few_pieces_are_looked_at_in_parts():
     assert np.array_equal([begin[:, 0], end[:, -1]], ranges)
     assert np.array_equal(few.segment[:count], np.repeat(np.arange(3), begin.shape[1]))
     many = first_ones(Waiting(pieces, number[-1]), at_once)
-    assert np.array_equal(many.range, pieces.range[:, :at_once])
+    assert np.array_equal(many.range, pieces.range[:, : at_once.pieces])
 
 
 def test_topology_is_the_same_whether_traced_or_not():

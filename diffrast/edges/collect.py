@@ -156,7 +156,7 @@ def _edges(
 
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
-            pieces = first_ones(waiting, at_once.pieces)
+            pieces = first_ones(waiting, at_once)
             found, left = look(
                 pieces,
                 segments,

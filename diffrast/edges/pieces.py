@@ -25,16 +25,20 @@ from diffrast._topology import Edges
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
 PIECES_AT_ONCE = 256, 512
-PARTS = 16  # in which pieces are looked at where so many of all fill a batch
+PARTS = 16  # in which pieces are looked at where there are few
 _EDGE_ON = 8  # roundings in the volume of a face
 
 
 class AtOnce(NamedTuple):
-    """How many edges are clipped at once, how many pieces cut, and how many looked at."""
+    """How many edges are clipped at once, how many pieces cut, and how many looked at.
+
+    As many as are `few` are looked at in parts.
+    """
 
     edges: int
     cut: int
     pieces: int
+    few: int
 
 
 class Segments(NamedTuple):
@@ -68,8 +72,9 @@ def usual_batches(edges: int, pixels: int, lanes: int) -> AtOnce:
     """
     usual = 1 << round(math.log2(math.sqrt(edges) + math.sqrt(pixels)))
     least, most = PIECES_AT_ONCE
-    pieces = lanes * min(max(usual, least), most)
-    return AtOnce(8 * pieces, 2 * pieces, pieces)
+    usual = min(max(usual, least), most)
+    pieces = lanes * usual
+    return AtOnce(8 * pieces, 2 * pieces, pieces, usual // PARTS)
 
 
 def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Table:
@@ -303,13 +308,13 @@ def behind(waiting: Waiting, pieces: Pieces, count: Array) -> Waiting:
     return Waiting(jax.tree.map(put, waiting.pieces, pieces), waiting.total + count)
 
 
-def first_ones(waiting: Waiting, at_once: int) -> Pieces:
+def first_ones(waiting: Waiting, at_once: AtOnce) -> Pieces:
     """As many as are looked at at once; in parts, each of them, if these are few.
 
     What hides a piece here and there is found one part after the other.
     """
-    parts = jnp.where(waiting.total <= at_once // PARTS, PARTS, 1)
-    number = jnp.arange(at_once)
+    parts = jnp.where(waiting.total <= at_once.few, PARTS, 1)
+    number = jnp.arange(at_once.pieces)
     piece, part = number // parts, number % parts
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
     begin, end = range_

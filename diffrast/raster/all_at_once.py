@@ -1,8 +1,9 @@
 """Coverage on a GPU: all pixels of all faces, of all views, side by side.
 
-Faces are cut into blocks of 8×8 pixels, these are numbered through, and every pixel of some ten
-thousand blocks finds out by itself whether it is inside and how near. The nearest key at a pixel of
-the image is a scattered maximum; of the faces that have it, the first drawn is a scattered minimum.
+Faces are cut into blocks of 8×8 pixels, or of 4×4 where they are many for the picture. These are
+numbered through, and every pixel of some ten thousand blocks finds out by itself whether it is
+inside and how near. The nearest key at a pixel of the image is a scattered maximum; of the faces
+that have it, the first drawn is a scattered minimum.
 Keys are stored, not computed twice, so that what is equal stays equal, and nothing depends on the
 order in which a GPU works.
 
@@ -42,9 +43,9 @@ from diffrast.raster.fixed_point import (
     subpixel_bits,
 )
 
-_BLOCK = 8  # rows and columns, a divisor of those of a tile
+_BLOCKS = 4, 8  # rows and columns, divisors of those of a tile
 _FACES_AT_ONCE = 1 << 20
-_BLOCKS_AT_ONCE = 1 << 17
+_PIXELS_AT_ONCE = 1 << 23  # of blocks
 _NONE = (1 << 31) - 1  # rank where there is no face
 
 
@@ -116,11 +117,13 @@ def _draw_views(
     snap = partial(snap_vertices, height=image.height, width=image.width)
     vertices = Vertices(*(column.reshape(-1) for column in jax.vmap(snap)(positions_clip)))
     vertices = stored(vertices)
+    many = face_count * _BLOCKS[0] ** 2 > image.height * image.width
+    side = _BLOCKS[0] if many else _BLOCKS[1]
     # The blocks of all of them can be counted.
-    most_blocks = (image.height // _BLOCK + 2) * (image.width // _BLOCK + 2)
+    most_blocks = (image.height // side + 2) * (image.width // side + 2)
     faces_at_once = min(views * face_count, _FACES_AT_ONCE, _NONE // most_blocks)
     usual = 2 * faces_at_once + 4 * most_blocks  # so that mostly one batch is all
-    blocks_at_once = min(1 << (usual - 1).bit_length(), _BLOCKS_AT_ONCE)
+    blocks_at_once = min(1 << (usual - 1).bit_length(), _PIXELS_AT_ONCE // side**2)
 
     def draw_faces(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         number = n * faces_at_once + jnp.arange(faces_at_once)
@@ -131,7 +134,7 @@ def _draw_views(
             vertices, corners, height=image.height, width=image.width, cull_backfaces=cull_backfaces
         )
         rank = classes * face_count + face
-        some, blocks = _ready(vertices, corners, classes, view, rank, image, cull_backfaces)
+        some, blocks = _ready(vertices, corners, classes, view, rank, image, cull_backfaces, side)
         blocks = jnp.where(number < views * face_count, blocks, 0)
         ends = stored(jnp.cumsum(blocks))
         starts = ends - blocks
@@ -140,7 +143,7 @@ def _draw_views(
             block = m * blocks_at_once + jnp.arange(blocks_at_once)
             owner = jnp.searchsorted(ends, block, side="right", method="scan_unrolled")
             owner = stored(jnp.minimum(owner, faces_at_once - 1))
-            inside, place, key = _pixels(some, owner, block - starts[owner], image)
+            inside, place, key = _pixels(some, owner, block - starts[owner], image, side)
             place = jnp.where(inside & (block < ends[-1])[:, None, None], place, pixel_count)
             ranks = jnp.broadcast_to(some.rank[owner][:, None, None], place.shape)
             return _nearest(state, *(part.reshape(-1) for part in (place, key, ranks)))
@@ -166,14 +169,15 @@ def _ready(
     rank: Array,
     image: Image,
     cull_backfaces: bool,
+    side: int,
 ) -> tuple[_Faces, Int[Array, " F"]]:
-    """Faces, and of how many blocks they are."""
+    """Faces, and of how many blocks of so many rows and columns they are."""
     sweep = set_up(corners_of(vertices, corners, jnp.arange(rank.size)), image, cull_backfaces)
     (column, last_column), (row, last_row) = sweep.columns, sweep.rows
     small = classes < LARGE
     drawn = (classes < CULLED) & (column <= last_column) & (row <= last_row)
-    column, row = (jnp.where(small, first, first // _BLOCK * _BLOCK) for first in (column, row))
-    across, down = (last_column - column) // _BLOCK + 1, (last_row - row) // _BLOCK + 1
+    column, row = (jnp.where(small, first, first // side * side) for first in (column, row))
+    across, down = (last_column - column) // side + 1, (last_row - row) // side + 1
 
     inverse_w = 1 / jnp.where(vertices.w > 0, vertices.w, 1)
     x, y, values = (
@@ -193,12 +197,12 @@ def _ready(
 
 
 def _pixels(
-    faces: _Faces, owner: Int[Array, " n"], number: Int[Array, " n"], image: Image
+    faces: _Faces, owner: Int[Array, " n"], number: Int[Array, " n"], image: Image, side: int
 ) -> tuple[Array, Array, Array]:
     """Of all pixels of blocks, counted within their faces: whether inside, which, and the key."""
     own = stored(jax.tree.map(lambda column: column[..., owner], faces))
-    column = own.column + number % own.across * _BLOCK
-    row = own.row + number // own.across * _BLOCK
+    column = own.column + number % own.across * side
+    row = own.row + number // own.across * side
     corner_column = jnp.where(own.small, own.column, column // TILE[1] * TILE[1])
     corner_row = jnp.where(own.small, own.row, row // TILE[0] * TILE[0])
     starts = stored([edge_value(edge, column, row) for edge in each_edge(own.edges)])
@@ -213,7 +217,7 @@ def _pixels(
     def spread(x: Array) -> Array:
         return x[:, None, None]
 
-    rows, columns = jnp.arange(_BLOCK)[:, None], jnp.arange(_BLOCK)
+    rows, columns = jnp.arange(side)[:, None], jnp.arange(side)
     outside = jnp.zeros((), jnp.int32)
     for start, edge in zip(starts, each_edge(own.edges), strict=True):
         outside = outside | (spread(start) + spread(edge.a) * columns + spread(edge.b) * rows)
