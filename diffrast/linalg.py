@@ -174,6 +174,8 @@ def shear(
 def compose(*matrices: ArrayInput) -> Float[Array, "4 4"]:
     """Product of 4x4 matrices: the rightmost acts first. None at all is the identity.
 
+    In full precision, which `@` lacks on a GPU or TPU unless JAX is told so.
+
     Example:
         >>> turn = dr.linalg.rotation((0, 0, 1), np.pi / 2)
         >>> move = dr.linalg.translation((1, 0, 0))
@@ -367,8 +369,8 @@ def se3_exp(twist: ArrayInput) -> Float[Array, "4 4"]:
     """Rigid motion of a twist (6,): translational part first, then the rotation vector.
 
     The motion that runs for unit time with a constant twist; its translation column equals
-    `twist[:3]` only where nothing turns. Smooth everywhere, so `se3_exp(step) @ pose` is a good
-    way to fit a pose. FEATURES T1.
+    `twist[:3]` only where nothing turns. Smooth everywhere, so `compose(se3_exp(step), pose)` is a
+    good way to fit a pose. FEATURES T1.
     """
     twist = float_array("twist", twist, (6,))
     velocity, vector = twist[:3], twist[3:]

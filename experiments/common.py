@@ -8,11 +8,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 import diffrast as dr
+
+# The library does not ask for it, but the experiments multiply matrices of their own.
+jax.config.update("jax_default_matmul_precision", "highest")
 
 DEFAULT_TARGET = Path(__file__).parent / "data" / "teapot_one_light.json"
 # Dull grey: where the fit of a material starts of which nothing is known.

@@ -9,7 +9,7 @@ import pytest
 from derivatives import check_derivatives
 from scipy.spatial.transform import Rotation
 
-from diffrast import opencv, viewing
+from diffrast import linalg, opencv, viewing
 from diffrast.camera import (
     Camera,
     clip_to_pixel,
@@ -313,9 +313,10 @@ def test_rays_of_a_distorted_camera_lead_to_the_centres_of_pixels(lens):
     camera = opencv_camera(distortion=np.array(LENSES[lens]), intrinsics=WIDE, width=100, height=50)
     rays, _ = both_directions(camera)
     want = np.stack(np.meshgrid(np.arange(-1, 101) + 0.5, np.arange(-1, 51) + 0.5), axis=-1)
-    eye = jnp.concatenate([rays @ camera.view[:3, :3].T, jnp.zeros_like(rays[..., :1])], axis=-1)
+    eye = linalg.apply_matrix(camera.view[:3, :3], rays)
+    eye = jnp.concatenate([eye, jnp.zeros_like(rays[..., :1])], axis=-1)
     assert (eye[..., 2] < 0).all()
-    clip = opencv.distort(eye, camera.distortion) @ camera.projection.T
+    clip = linalg.apply_matrix(camera.projection, opencv.distort(eye, camera.distortion))
     infinity = clip_to_pixel(clip, height=50, width=100)
     np.testing.assert_allclose(infinity[..., :2], want, atol=1e-4)
     for distance in (1.0, 1e5):

@@ -176,3 +176,16 @@ def test_temporary_memory_is_not_mapped_anew_at_each_call():
     ):
         memory = program.lower(*arguments).compile().memory_analysis()
         assert 1 << 20 < memory.temp_size_in_bytes < 32 << 20
+
+
+@pytest.mark.parametrize("part", ["camera", "transform", "vertices", "lights", "texels"])
+def test_products_of_matrices_are_in_full_precision_on_every_device(part):
+    """GPUs and TPUs round the factors to three digits, or fewer, unless they are told not to."""
+    given = scene(
+        {**SHINY, "texture": TEXTURE}, dataclasses.replace(SUN, shadow=dr.Shadow(resolution=16))
+    )
+    program, arguments = gradient(given, part, settings(antialias=True))
+    lines = program.lower(*arguments).as_text().splitlines()
+    products = [line for line in lines if "stablehlo.dot_general" in line]
+    assert products
+    assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)

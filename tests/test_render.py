@@ -233,7 +233,7 @@ def test_jacobian_equals_central_differences_of_the_oracle():
         def image(parameters):
             twist, direction, position = jnp.split(parameters, [6, 9])
             lights = changed_lights(scene.lights, direction, position)
-            moved = replace(camera, view=linalg.se3_exp(twist) @ camera.view)
+            moved = replace(camera, view=linalg.compose(linalg.se3_exp(twist), camera.view))
             image = dr.render(replace(scene, lights=lights), moved, settings())
             return image, image
 
