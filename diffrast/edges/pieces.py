@@ -24,7 +24,7 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
-PIECES_AT_ONCE = 256, 512
+PIECES_AT_ONCE = 128, 512
 PARTS = 16  # in which pieces are looked at where there are few
 _EDGE_ON = 8  # roundings in the volume of a face
 
