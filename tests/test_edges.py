@@ -221,7 +221,7 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
 
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
-    sizes = AtOnce(edges=64, cut=1024, pieces=512, few=32)
+    sizes = AtOnce(edges=64, cut=1024, pieces=512, parts=16)
     monkeypatch.setattr("diffrast.edges.collect.usual_batches", lambda *_: sizes)
     monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))

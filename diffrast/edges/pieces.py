@@ -24,21 +24,21 @@ from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
-PIECES_AT_ONCE = 128, 512
-PARTS = 16  # in which pieces are looked at where there are few
+PIECES_AT_ONCE = 256, 512
+FEW = 32  # pieces, each of which is looked at in parts
 _EDGE_ON = 8  # roundings in the volume of a face
 
 
 class AtOnce(NamedTuple):
     """How many edges are clipped at once, how many pieces cut, and how many looked at.
 
-    As many as are `few` are looked at in parts.
+    Where no more than `FEW` pieces are left they are looked at in so many parts each.
     """
 
     edges: int
     cut: int
     pieces: int
-    few: int
+    parts: int
 
 
 class Segments(NamedTuple):
@@ -74,7 +74,7 @@ def usual_batches(edges: int, pixels: int, lanes: int) -> AtOnce:
     least, most = PIECES_AT_ONCE
     usual = min(max(usual, least), most)
     pieces = lanes * usual
-    return AtOnce(8 * pieces, 2 * pieces, pieces, usual // PARTS)
+    return AtOnce(8 * pieces, 2 * pieces, pieces, usual // FEW)
 
 
 def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Table:
@@ -313,7 +313,7 @@ def first_ones(waiting: Waiting, at_once: AtOnce) -> Pieces:
 
     What hides a piece here and there is found one part after the other.
     """
-    parts = jnp.where(waiting.total <= at_once.few, PARTS, 1)
+    parts = jnp.where(waiting.total <= FEW, at_once.parts, 1)
     number = jnp.arange(at_once.pieces)
     piece, part = number // parts, number % parts
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
