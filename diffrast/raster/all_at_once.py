@@ -3,9 +3,8 @@
 Faces are cut into blocks of 8×8 pixels, or of 4×4 where they are many for the picture. These are
 numbered through, and every pixel of some ten thousand blocks finds out by itself whether it is
 inside and how near. The nearest key at a pixel of the image is a scattered maximum; of the faces
-that have it, the first drawn is a scattered minimum.
-Keys are stored, not computed twice, so that what is equal stays equal, and nothing depends on the
-order in which a GPU works.
+that have it, the first drawn is a scattered minimum. Keys are stored, not computed twice, so that
+what is equal stays equal, and nothing depends on the order in which a GPU works.
 
 The arithmetic is that of `one_by_one`: a face of the small classes counts its depth from its first
 pixel, a large one from the corner of a tile; of equal keys the smaller class has been drawn first.
