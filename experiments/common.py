@@ -15,7 +15,7 @@ from jax import Array
 
 import diffrast as dr
 
-# The library does not ask for it, but the experiments multiply matrices of their own.
+# For products of the experiments' own on a GPU or TPU; the library asks for it where it multiplies.
 jax.config.update("jax_default_matmul_precision", "highest")
 
 DEFAULT_TARGET = Path(__file__).parent / "data" / "teapot_one_light.json"

@@ -45,6 +45,13 @@ def test_all_at_once_sees_what_one_by_one_sees(name, cull_backfaces):
     assert_same(*clip_of(name), **size, cull_backfaces=cull_backfaces)
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_faces_that_are_few_for_the_picture_are_drawn_in_larger_blocks(name):
+    size = 192
+    assert FACES * min(all_at_once._BLOCKS) ** 2 < size**2
+    assert_same(*clip_of(name), height=size, width=size, cull_backfaces=False)
+
+
 def test_of_equal_faces_the_same_one_is_seen():
     """Small ones come before large ones, then the lower number counts."""
     positions_clip, faces = clip_of("soup")
