@@ -14,8 +14,8 @@ S = TypeVar("S")
 
 _OFF_CPU = 32  # times as many
 _STEPS_AT_ONCE = 4
-_VIEWS_AT_ONCE = 16, 256
-_PIXELS_AT_ONCE = 1 << 20
+_VIEWS_AT_ONCE = 16, 1024
+_PIXELS_AT_ONCE = 1 << 22
 
 
 def draws_on_cpu() -> bool:

@@ -141,6 +141,31 @@ def test_faces_of_a_pixel_that_pierce_and_hide_one_another_are_as_exact_as_16_sa
     assert abs(drawn() - many).mean() < share * abs(some - many).mean()
 
 
+SMOOTH = {
+    "ball": dr.shapes.icosphere(4),
+    "coarse ring": dr.shapes.torus(0.8, 0.35, major_segments=24, minor_segments=12),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "error"), [("ball", 64, 0.0011), ("coarse ring", 128, 0.0022)]
+)
+def test_colors_that_turn_at_a_rim_count_by_the_area_that_shows_them(name, size, error):
+    """A pixel reaches less far inwards from the ends of an edge than from its middle."""
+    sun = dr.DirectionalLight(direction=(-1, -1, -2), ambient=(0.1,) * 3)
+    thing = dr.Object(SMOOTH[name], dr.Material(specular=(0.5,) * 3))
+    view = dr.Camera.perspective(eye=(1.2, 2, 3), target=(0, 0, 0), fov_y=0.7, near=0.1, far=99.0)
+
+    def drawn(**options):
+        settings = dr.RenderSettings(height=size, width=size, **options)
+        return np.float64(
+            jax.jit(dr.render)(dr.Scene(objects=[thing], lights=[sun]), view, settings)
+        )
+
+    apart = drawn() - drawn(antialias=False, samples=256)
+    assert np.sqrt((apart**2).mean()) < error
+
+
 def test_what_thin_faces_hide_shows_no_edge():
     """The faces in front are so thin that the pixels beside the edge may see none of them."""
     wall = dr.shapes.plane(8.0, 8.0, divisions=(2, 130))

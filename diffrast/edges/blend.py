@@ -222,8 +222,8 @@ def with_pieces(
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
-        mean = integral - rim.depth * near
-        value = jnp.where(smooth, area * (behind - near) + length * mean, area * jump)
+        turn = length * (integral - jnp.mean(rim.reaches, axis=0) * near)
+        value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         own = _colors(view.image, centre)
         value = jnp.where(found.wrong_side, value + front - own, value)
     jump, value, front, behind = stored((jump, value, front, behind))
@@ -311,10 +311,10 @@ def _along(
 ) -> tuple[Array, Array]:
     """The colour of a smooth surface from its rim to where the pixel ends.
 
-    Its integral over this depth; and the colour that counts as the rim moves. As a point at a
-    fixed depth keeps its colour, that is the one at the pixel's border, less what the derivative of
-    the next pixel, which stands for this one's, says of it: as far as its colour is carried along,
-    that is its slope.
+    Its integral over this depth, a mean along the piece, from whose ends a pixel reaches less far;
+    and the colour that counts as the rim moves. As a point at a fixed depth keeps its colour, that
+    is the one at the pixel's border, less what the derivative of the next pixel, which stands for
+    this one's, says of it: as far as its colour is carried along, that is its slope.
     """
     rim = seen.rim
     first, depth = rim.first, rim.depth
@@ -330,14 +330,21 @@ def _along(
     far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
     far = jnp.where(first < depth, far, bend)
     centre = jnp.clip(seen.centre_depth, first, depth)
-    mean = jnp.where(rim.single, 1 / 2, 2 / 3)
     passes = centre > first
     near = jnp.where(passes, near, bend)
-    integral = (
-        first * (front + bend) / 2
-        + (centre - first) * (bend + mean * (near - bend))
-        + (depth - centre) * (near + jnp.where(passes, 1 / 2, mean) * (far - near))
-    )
+
+    def between(begin: Array, end: Array, colors: tuple[Array, Array], straight: Array) -> Array:
+        """The integral over these depths; of colours that change straight or with the root."""
+        at = jnp.clip(rim.reaches, begin, end) - begin
+        share = at / jnp.maximum(end - begin, _SHALLOW)
+        share = at * jnp.where(straight, share / 2, 2 / 3 * jnp.sqrt(share))
+        weight = jnp.mean(share, axis=0)
+        return jnp.mean(at, axis=0) * colors[0] + weight * (colors[1] - colors[0])
+
+    integral = between(jnp.zeros_like(first), first, (front, bend), jnp.ones_like(passes))
+    integral += between(first, centre, (bend, near), rim.single)
+    integral += between(centre, depth, (near, far), passes | rim.single)
+    integral += jnp.mean(jnp.maximum(rim.reaches - depth, 0), axis=0) * far
 
     def moved(at: Array) -> Array:
         share = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))

@@ -12,6 +12,7 @@ from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
+_EIGHTHS = (-3 / 8, -1 / 8, 1 / 8, 3 / 8)  # of a piece, from its middle
 SHORT = 1e-3  # pixels: no piece is left that is shorter
 
 
@@ -20,7 +21,8 @@ class Rim(NamedTuple):
 
     smooth: Bool[Array, " n"]  # whether this pixel and the next show the same smooth surface
     inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards
-    depth: Float[Array, " n"]  # how far the pixel reaches,
+    reaches: Float[Array, "4 n"]  # how far the pixel reaches, from the middles of four parts
+    depth: Float[Array, " n"]  # and from that of the whole,
     first: Float[Array, " n"]  # and how far the face at the edge does, if that is less
     bend: tuple[Int[Array, " n"], Columns]  # face and barycentrics where that face ends
     far: tuple[Int[Array, " n"], Columns]  # and where the pixel ends
@@ -35,9 +37,15 @@ def next_inwards(
     middle: Float[Array, "2 n"], inward: Float[Array, "2 n"]
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """How far a pixel reaches from points inwards, and which of the 3×3 is next: see `Rim`."""
-    exits = (0.5 - jnp.sign(inward) * middle) / jnp.maximum(abs(inward), _SMALL)
-    depth = stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
+    depth = _reach(middle, inward)
     return depth, stored(pixel_at(middle, inward, depth + 0.5))
+
+
+def _reach(
+    point: Float[Array, "2 *size"], inward: Float[Array, "2 *size"]
+) -> Float[Array, "*size"]:
+    exits = (0.5 - jnp.sign(inward) * point) / jnp.maximum(abs(inward), _SMALL)
+    return stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
 
 
 def look_inwards(
@@ -47,6 +55,7 @@ def look_inwards(
     inwards: tuple[Float[Array, " n"], Int[Array, " n"]],
     connected: Bool[Array, " n"],
     middle: Float[Array, "2 n"],
+    across: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
     centre: Float[Array, "2 n"],
     faces: Int[Array, "F 3"],
@@ -63,6 +72,7 @@ def look_inwards(
         inwards: what `next_inwards` tells.
         connected: whether the pixel that shows the front and the next one inwards show its surface.
         middle: of the piece, from the pixel's centre.
+        across: from the piece's begin to its end.
         inward: unit normal towards the face in front.
         centre: of the pixel, on the screen.
         faces: corners of faces.
@@ -91,6 +101,7 @@ def look_inwards(
     return Rim(
         smooth=(front >= 0) & connected & goes_on,
         inner=inner,
+        reaches=jnp.stack([_reach(middle + way * across, inward) for way in _EIGHTHS]),
         depth=depth,
         first=first,
         bend=(front, [b / total for b in bend]),

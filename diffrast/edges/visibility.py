@@ -41,6 +41,7 @@ from diffrast.edges.planes import (
     covers,
     edge_values,
     inverse_depth_slope,
+    lowest,
     on_edge,
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
@@ -267,7 +268,12 @@ def look(
     alike = jnp.stack([picked(patch, look) for look in looks]) == front_patch
     alike = alike & fold & (ours >= 0)
     x, y = centre[:, None] + steps_to(looks)
-    ahead = edge_values(corners_of(ours, faces, pixels), x, y)[1] - near
+    both = jnp.stack([ours, jnp.broadcast_to(front, ours.shape)])
+    values, inverse_depths = edge_values(corners_of(both, faces, pixels), x, y)
+    ahead = inverse_depths[0] - near
+    # Where the face in front reaches a centre that shows another one, it is hidden there.
+    least_share = lowest(barycentrics([value[1] for value in values]))[0]
+    hidden = (least_share > FINE_TOLERANCE) & (ours != front)
     planes = jnp.stack([picked(depths, look) for look in looks]) - near
     plain = (ours == front) | jnp.any(nearby[:, None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
@@ -280,7 +286,8 @@ def look(
     reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
     in_front = reached_depth > near * (1 + FINE_TOLERANCE)
     touches = ~in_front[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
-    connected = alike & (plain | (arrives[2:] & (touches | (reached[2:] == front))))
+    connected = plain | (arrives[2:] & (touches | (reached[2:] == front)))
+    connected = connected & alike & ~hidden
     hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & in_front[:2]
     visible = visible & ~jnp.any(hides, axis=0)
     lies = search & arrives[1] & ~hides[1] & (reached_depth[1] > least)
@@ -308,6 +315,7 @@ def look(
         inwards,
         connected[0] & connected[1],
         middle,
+        end - begin,
         -out,
         centre,
         faces,
