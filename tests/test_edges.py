@@ -44,6 +44,12 @@ def camera(eye=(0.3, 2.0, 3.0)):
     return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.9, near=0.1, far=30.0)
 
 
+def image_of(objects, sun, view, size, **options):
+    settings = dr.RenderSettings(height=size, width=size, **options)
+    scene = dr.Scene(objects=objects, lights=[sun])
+    return np.float64(jax.jit(dr.render)(scene, view, settings))
+
+
 def picture(vertices, camera):
     mesh = dataclasses.replace(MESH, vertices=vertices)
     return dr.render(dr.Scene(objects=[dr.Object(mesh)], lights=LIGHTS), camera, SETTINGS)
@@ -130,13 +136,8 @@ def test_faces_of_a_pixel_that_pierce_and_hide_one_another_are_as_exact_as_16_sa
         dr.Object(dr.shapes.plane(8.0, 8.0), None, lying),
     ]
     sun = dr.DirectionalLight(direction=(-0.8, -1, -0.5), diffuse=(0.8,) * 3, ambient=(0.1,) * 3)
-    scene = dr.Scene(objects=objects, lights=[sun])
     view = dr.Camera.perspective(eye=(1, 1.5, 4), target=(0, 0, 0), fov_y=0.7, near=0.1, far=50.0)
-
-    def drawn(**options):
-        settings = dr.RenderSettings(height=80, width=80, shading=shading, **options)
-        return np.float64(jax.jit(dr.render)(scene, view, settings))
-
+    drawn = functools.partial(image_of, objects, sun, view, 80, shading=shading)
     many, some = (drawn(antialias=False, samples=samples) for samples in (256, 16))
     assert abs(drawn() - many).mean() < share * abs(some - many).mean()
 
@@ -156,12 +157,7 @@ def test_colors_that_turn_at_a_rim_count_by_the_area_that_shows_them(name, size,
     thing = dr.Object(SMOOTH[name], dr.Material(specular=(0.5,) * 3))
     view = dr.Camera.perspective(eye=(1.2, 2, 3), target=(0, 0, 0), fov_y=0.7, near=0.1, far=99.0)
 
-    def drawn(**options):
-        settings = dr.RenderSettings(height=size, width=size, **options)
-        return np.float64(
-            jax.jit(dr.render)(dr.Scene(objects=[thing], lights=[sun]), view, settings)
-        )
-
+    drawn = functools.partial(image_of, [thing], sun, view, size)
     apart = drawn() - drawn(antialias=False, samples=256)
     assert np.sqrt((apart**2).mean()) < error
 
