@@ -114,6 +114,11 @@ def comes_held(face: Array, in_batches: bool) -> bool:
 
 def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
     points = inputs.points or visible_points(inputs.drawn, inputs.face)
+    if not draws_on_cpu():
+        # The derivatives of shading and of what is seen would become one kernel, with more sums
+        # and images than a GPU has registers for.
+        position, normal = map(lax.optimization_barrier, (points.position, points.normal))
+        points = points._replace(position=position, normal=normal)
     colors = shade(inputs.data, points, inputs.reached)
     return _before_background(colors, inputs)
 
