@@ -37,6 +37,7 @@ from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 from diffrast.texture import CubeTexture
 from diffrast.texturing import paint_scene, seams, skybox
+from diffrast.turning import with_turns
 
 
 class Buffers(NamedTuple):
@@ -72,7 +73,8 @@ def render(
 
     Differentiable in every continuous part of the scene and the camera; with `settings.antialias`
     through the visibility of edges as well (`diffrast.edges`), the second derivatives of which are
-    left out. Compiled at the first call for each structure of the scene, image size and setting.
+    left out, like those of what is added where colours turn within a pixel (`diffrast.turning`).
+    Compiled at the first call for each structure of the scene, image size and setting.
 
     Args:
         scene: what is seen.
@@ -143,8 +145,13 @@ def render(
         held = comes_held(face, in_batches)
     if settings.antialias:
         with jax.named_scope("edges"):
-            image = interleaved(color) if held else assemble([stored_alone(c) for c in color])
-            image = _with_edges(image, world, clip, pixels, reached, background, settings)
+            hard = interleaved(color) if held else assemble([stored_alone(c) for c in color])
+            image = _with_edges(hard, world, clip, pixels, reached, background, settings)
+        if in_batches:
+            with jax.named_scope("turning"):
+                neighbors = jnp.asarray(scene_topology(scene).neighbors)
+                unshadowed = world._replace(shadows=None)
+                image = with_turns(shader, unshadowed, drawn, face, reached, neighbors, hard, image)
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]

@@ -13,10 +13,11 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._device import lanes
+from diffrast._linear import linear_zeros
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
 from diffrast.edges.collect import collect, each_view
-from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear, linear_zeros
+from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of
 from diffrast._stored import stored
 from diffrast.edges.blend import Method, View, cropped
@@ -155,35 +156,14 @@ def _pull(
     return points, inwards + jnp.where(rim[:, None], 0, own)
 
 
-def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
-    """Zeros that depend on a tangent: derivatives leave out what is known not to."""
-    return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
-
-
 def apply_linear(
     view: View, method: Method, records: Records, rims: Array, points: Array, colors: Array
 ) -> Array:
-    """`_push`, written as a linear system so that JAX knows both directions.
-
-    The system is triangular, (points, colors, out - push) = (points, colors, 0), and its solution
-    and that of its transpose are loops over as many pieces as there are. The transpose's right side
-    is zero but for the image, since nothing else of the solution is used. It has to depend on all
-    parts of its right side, and what comes out on all parts of its solution, if only by one number
-    each: derivatives of it and of its transpose, again, leave out none.
-    """
-
-    def matvec(x: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        return x
-
-    def solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        push = each_view(_push, method, rims.size)
-        return b[0], b[1], push(view, records, rims, *b)
-
-    def transpose_solve(_: Any, b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        pull = each_view(_pull, method, rims.size)
-        return *pull(view, records, rims, b[2]), b[2]
-
-    nothing = jnp.zeros_like(cropped(colors, view.image.shape)).at[0, 0].add(0 * points[0, 0])
-    right = points, colors, nothing
-    points, colors, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
-    return out.at[0, 0].add(0 * points[0, 0] + 0 * colors[0, 0])
+    """`_push`, of which JAX knows both directions."""
+    push, pull = (each_view(way, method, rims.size) for way in (_push, _pull))
+    return linear_map(
+        lambda changes, nothing: push(view, records, rims, *changes, nothing),
+        lambda cotangent: pull(view, records, rims, cotangent),
+        (points, colors),
+        jnp.zeros_like(cropped(colors, view.image.shape)),
+    )

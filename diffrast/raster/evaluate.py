@@ -148,7 +148,10 @@ def carry(drawn: Drawn, pixels: Pixels) -> Carried:
 
 @partial(carry.defjvp, symbolic_zeros=True)
 def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
-    """Taken from faces, not from vertices: the transpose adds up all pixels that see a face."""
+    """Taken from faces, not from vertices: the transpose adds up all pixels that see a face.
+
+    But not of fewer pixels than there are faces.
+    """
     (drawn, pixels), (change, _) = primals, tangents
     faces, face = drawn.faces, pixels.face
     barycentrics = evaluate(drawn, pixels).barycentrics
@@ -157,6 +160,9 @@ def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
     zero = varying_zero((drawn, pixels))
 
     def change_of(column: Array) -> Array:
+        if face.size < faces.shape[0]:
+            at = [jnp.where(face >= 0, column[corner], 0) for corner in corners_at(faces, face)]
+            return blend(barycentrics, at) + zero
         corners = [stored(column[faces[:, j]], witness) for j in range(3)]
         at = [corner.at[visible].get(mode="fill", fill_value=0) for corner in corners]
         return blend(barycentrics, at) + zero

@@ -1,0 +1,50 @@
+"""Linear maps that are loops over as many batches as there are, in both directions.
+
+JAX transposes no loop whose length is known only when it runs.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
+    """Zeros that depend on a tangent: derivatives leave out what is known not to."""
+    return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
+
+
+def linear_map(
+    push: Callable[..., Array], pull: Callable[[Array], Any], changes: Any, nothing: Array
+) -> Array:
+    """`push(changes, nothing)`, written as a linear system so that JAX knows both directions.
+
+    The system is triangular, (changes, out - push) = (changes, nothing), and its solution and that
+    of its transpose are the functions given. The transpose's right side is zero but for `out`,
+    since nothing else of the solution is used. What comes out has to depend on all parts of its
+    solution, if only by one number each, and `nothing` on one of the changes: derivatives of it and
+    of its transpose, again, leave out none.
+
+    Args:
+        push: adds what a tree of changes means to zeros of the shape of the result.
+        pull: its transpose, of the result alone.
+        changes: a tree of arrays.
+        nothing: zeros, of two axes.
+    """
+
+    def traces(tree: Any) -> Array:
+        first, *others = (0 * leaf[(0,) * leaf.ndim] for leaf in jax.tree.leaves(tree))
+        return sum(others, first)
+
+    def solve(_: Any, b: tuple[Any, Array]) -> tuple[Any, Array]:
+        return b[0], push(*b)
+
+    def transpose_solve(_: Any, b: tuple[Any, Array]) -> tuple[Any, Array]:
+        return pull(b[1]), b[1]
+
+    # Of all changes, memory would be held longer.
+    right = changes, nothing.at[0, 0].add(traces(jax.tree.leaves(changes)[0]))
+    changes, out = lax.custom_linear_solve(lambda x: x, right, solve, transpose_solve)
+    return out.at[0, 0].add(traces(changes))

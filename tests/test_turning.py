@@ -1,0 +1,147 @@
+"""Colours that turn within a pixel: against many samples, in both directions, in odd scenes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_render import operations, times
+
+import diffrast as dr
+from diffrast import turning
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+SHINY = {"diffuse": (0.6, 0.5, 0.4), "specular": (0.8, 0.8, 0.8), "shininess": 60.0}
+RING = dr.shapes.torus(major_segments=24, minor_segments=12)
+
+
+def scene(mesh=RING, material=SHINY, shift=(0.0, 0.0, 0.0), **light):
+    options = {"direction": (-1.0, -1.0, -2.0), "ambient": (0.2, 0.2, 0.2)} | light
+    thing = dr.Object(mesh, dr.Material(**material), dr.linalg.translation(shift))
+    return dr.Scene(objects=[thing], lights=[dr.DirectionalLight(**options)])
+
+
+def camera(eye=(1.2, 2.0, 2.2)):
+    return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.8, near=0.1, far=9)
+
+
+def settings(size, **options):
+    return dr.RenderSettings(height=size, width=size, **options)
+
+
+def test_highlights_smaller_than_pixels_are_nearer_to_many_samples():
+    truth = dr.render(scene(), camera(), settings(64, antialias=False, samples=256))
+    sampled = dr.render(scene(), camera(), settings(64, antialias=False, samples=16))
+    picture = dr.render(scene(), camera(), settings(64))
+    ours, theirs = (np.asarray(image - truth) for image in (picture, sampled))
+    assert np.mean(ours**2) < 0.0021**2 < np.mean(theirs**2)
+    assert np.mean(abs(ours)) < 0.0006
+
+
+def parameters_of(values):
+    return scene(shift=values[:3], direction=jnp.array([-1.0, -1, -2]) + values[3:])
+
+
+def test_both_directions_of_the_derivative_and_views_agree():
+    rng = np.random.default_rng(3)
+    tangent, weight = (jnp.asarray(rng.normal(size=s), jnp.float32) for s in (6, (40, 40, 3)))
+
+    def picture(eye, values):
+        return dr.render(parameters_of(values), camera(eye), settings(40))
+
+    eyes = jnp.array([[1.2, 2.0, 2.2], [1.0, 1.5, 3.0]])
+    forward = jax.jit(lambda eye: jax.jvp(lambda v: picture(eye, v), (jnp.zeros(6),), (tangent,)))
+    back = jax.jit(lambda eye: jax.vjp(lambda v: picture(eye, v), jnp.zeros(6))[1](weight)[0])
+    for eye in eyes:
+        change = jnp.vdot(weight, forward(eye)[1])
+        np.testing.assert_allclose(jnp.vdot(back(eye), tangent), change, rtol=2e-4)
+    want = jax.tree.map(lambda *x: jnp.stack(x), *map(forward, eyes))
+    got = jax.jit(jax.vmap(forward))(eyes)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-4), got, want)
+
+
+def test_what_is_added_has_its_own_derivative(monkeypatch):
+    """Found in batches, against JAX's derivative of the same colours, and of vertices as well."""
+    found = []
+
+    def watched(shade, size, inputs):
+        found.append((shade, size, inputs))
+        return jnp.zeros((inputs.turning.number.size, 3))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(turning, "_added", watched)
+        patch.setattr(turning, "PIXELS_AT_ONCE", 32)
+        patch.setattr(turning, "_FEW", 32)
+        dr.render.__wrapped__(scene(), camera(), settings(40))
+        ((shade, size, inputs),) = found
+        assert 32 < inputs.turning.total <= inputs.turning.number.size
+
+        def colors(vertices, direction, at_once):
+            patch.setattr(turning, "PIXELS_AT_ONCE", at_once)
+            attributes = (vertices, *inputs.drawn.attributes[1:])
+            (light,) = inputs.data.scene.lights
+            placed = inputs.drawn.placed._replace(attributes=attributes)
+            drawn = inputs.drawn._replace(attributes=attributes, placed=placed)
+            lit = dr.DirectionalLight(direction=direction, ambient=light.ambient)
+            data = inputs.data._replace(
+                scene=dr.Scene(objects=inputs.data.scene.objects, lights=[lit])
+            )
+            return inputs._replace(data=data, drawn=drawn)
+
+        rng = np.random.default_rng(0)
+        at = inputs.drawn.attributes[0], jnp.array([-1.0, -1, -2])
+        way = tuple(jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in at)
+        places = inputs.turning.number.size
+        used = (jnp.arange(places) < inputs.turning.total)[:, None]
+
+        def in_one_go(*values):
+            whole = colors(*values, places)
+            return used * turning._of_batch(shade, size, whole, jnp.zeros((), jnp.int32))
+
+        def in_batches(*values):
+            return REAL_ADDED(shade, size, colors(*values, 32))
+
+        want, want_change = jax.jvp(in_one_go, at, way)
+        got, change = jax.jvp(in_batches, at, way)
+        np.testing.assert_allclose(used * got, want, atol=5e-5)
+        scale = np.abs(want_change).max()
+        np.testing.assert_allclose(used * change, want_change, atol=1e-3 * scale)
+        weight = used * jnp.asarray(rng.normal(size=want.shape), jnp.float32)
+        pulled, others = (jax.vjp(f, *at)[1](weight) for f in (in_batches, in_one_go))
+        for ours, theirs in zip(pulled, others, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-3 * np.abs(theirs).max())
+
+
+REAL_ADDED = turning._added
+
+
+@pytest.mark.parametrize("kind", ["rough", "black", "huge", "not finite"])
+def test_odd_pictures_end_and_stay_finite(kind):
+    """Where every pixel bends, or none, or where sums of colours leave their range."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=RING.vertices.shape) if kind == "rough" else RING.normals
+    mesh = dr.Mesh(vertices=RING.vertices, faces=RING.faces, normals=normals)
+    material = {"rough": SHINY, "black": {"diffuse": (0, 0, 0)}}.get(
+        kind, {"diffuse": (1e37, 1e37, 1e37)} if kind == "huge" else {"diffuse": (1e39, 0, 0)}
+    )
+    if kind == "not finite":
+        material = {"diffuse": (3e38, 3e38, 3e38)}
+
+    def loss(shift):
+        given = scene(mesh, material, shift=shift, diffuse=(2.0, 2, 2), ambient=(0.0, 0, 0))
+        return jnp.sum(dr.render(given, camera(), settings(32)) * 1e-38)
+
+    value, gradient = jax.value_and_grad(loss)(jnp.zeros(3))
+    if kind != "not finite":
+        assert np.isfinite(value)
+        assert np.all(np.isfinite(gradient))
+
+
+def test_what_cannot_turn_has_no_part_in_the_program():
+    def loops(given, **options):
+        return times(operations(dr.render, given, camera(), settings(16, **options)), "while")
+
+    smooth = loops(scene())
+    for shading in ("flat", "gouraud", "unlit"):
+        assert loops(scene(), shading=shading) < smooth
+    assert loops(scene(), antialias=False) < loops(scene(), shading="unlit")
