@@ -51,7 +51,7 @@ def moved_light(light, params):
 
 
 # Scenes whose meshes are padded to one size, so that they have one compiled program in common.
-ALIKE = ("cubes", "piercing", "border", "sphere", "torus2", "lattice", "shards")
+ALIKE = ("cubes", "piercing", "border", "sphere", "torus8", "torus2", "lattice", "shards")
 NOTHING = dr.Mesh(vertices=np.zeros((1, 3)), faces=[[0, 0, 0]], normals=np.ones((1, 3)))
 
 
