@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from diffrast._check import instance_of
 from diffrast._stored import assemble, interleaved, stored, stored_alone
+from diffrast._topology import Topology
 from diffrast.camera import Camera, central_rays
 from diffrast.deferred import comes_held, shade_covered
 from diffrast.edges import View, antialias_image
@@ -146,10 +147,11 @@ def render(
     if settings.antialias:
         with jax.named_scope("edges"):
             hard = interleaved(color) if held else assemble([stored_alone(c) for c in color])
-            image = _with_edges(hard, world, clip, pixels, reached, background, settings)
+            topology = scene_topology(scene)
+            image = _with_edges(hard, world, topology, clip, pixels, reached, background, settings)
         if in_batches:
             with jax.named_scope("turning"):
-                neighbors = jnp.asarray(scene_topology(scene).neighbors)
+                neighbors = jnp.asarray(topology.neighbors)
                 unshadowed = world._replace(shadows=None)
                 image = with_turns(shader, unshadowed, drawn, face, reached, neighbors, hard, image)
         if side == 1:
@@ -251,6 +253,7 @@ def _check_kinds(scene: Scene, camera: Camera, settings: RenderSettings) -> None
 def _with_edges(
     image: Array,
     world: World,
+    topology: Topology,
     positions_clip: Array,
     pixels: Points,
     reached: Reached,
@@ -258,7 +261,6 @@ def _with_edges(
     settings: RenderSettings,
 ) -> Array:
     geometry = world.geometry
-    topology = scene_topology(world.scene)
     cast = cast_outlines(world, topology, pixels, reached)
     apart = apart_edges(geometry, topology.edges, settings.shading)
     if settings.shading == "flat":  # every face has a colour of its own

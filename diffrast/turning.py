@@ -106,19 +106,14 @@ def with_turns(
     find = over_views(lambda _: found, height * width)
     turning = find(*seen, drawn.faces, neighbors)
     added = _added(shade, (height, width), _Inputs(data, drawn, turning))
-    used = jnp.arange(turning.number.size) < turning.total
+    place = jnp.arange(turning.number.size)
     row, column = jnp.divmod(turning.number, width)
-    return image.at[jnp.where(used, row, height), column].add(
-        added, mode="drop", unique_indices=True
-    )
+    row = jnp.where(place < turning.total, row, height + place)  # none twice
+    return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
 
 def _bending(face_image: Array, hard: Array, image: Array) -> tuple[Array, Array]:
-    """Numbers of the pixels where colours bend most, and how many they are.
-
-    If there are too many, those that bend twice, four times, ... as much.
-    """
-    height, width = image.shape[:2]
+    """Numbers of the pixels where colours bend most, and how many they are."""
     total = hard[..., 0] + hard[..., 1] + hard[..., 2]
     rows = slice(_ROWS // 2, None, _ROWS)
     some = face_image[rows] >= 0
@@ -132,40 +127,8 @@ def _bending(face_image: Array, hard: Array, image: Array) -> tuple[Array, Array
     down = _bend(known[:-2, 1:-1], middle, known[2:, 1:-1])
     bends = jnp.fmax(across, down)
     bends = stored(jnp.where(bends == bends, bends, 0))
-    blocks = jnp.pad(bends, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
-    blocks = jnp.max(blocks, axis=1).reshape(-1)
-    most = -(-height * width // _SHARE)
-    unit = PIXELS_AT_ONCE if most > PIXELS_AT_ONCE else _FEW
-    places = -(-most // unit) * unit
-
-    def twice(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        least = 2 * state[0]
-        order, size = compacted(blocks > least, jnp.arange(blocks.size, dtype=jnp.int32))
-
-        def add(block: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            numbers, total = state
-            first = block // width * _BLOCK * width + block % width
-            number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
-            bend = bends.reshape(-1).at[number].get(mode="fill", fill_value=0)
-            chosen = exists & (bend > least)
-            more, count = compacted(chosen.reshape(-1), number.reshape(-1))
-            return lax.dynamic_update_slice(numbers, more, (total,)), total + count
-
-        start = jnp.zeros_like(state[1]), zero_after(size)
-        return least, *over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
-
-    def are_few(state: tuple[Array, Array]) -> Array:
-        return state[1] <= places
-
-    def are_many(state: tuple[Array, Array, Array]) -> Array:
-        return ~are_few(state[1:])
-
-    zero = zero_after(blocks[0]).astype(jnp.int32)
-    room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
-    least = jnp.maximum(_BEND / 2 * mean, jnp.finfo(mean.dtype).tiny)  # else it may stay zero
-    start = least, room, zero + places + 1
-    _, number, count = lax.while_loop(are_many, twice, start)
-    return number[:places], count
+    least = jnp.maximum(_BEND * mean, jnp.finfo(mean.dtype).tiny)  # doubled, it must not stay zero
+    return _largest(bends, least)
 
 
 def _bend(one: Array, middle: Array, other: Array) -> Array:
@@ -174,6 +137,46 @@ def _bend(one: Array, middle: Array, other: Array) -> Array:
     both = to_one + to_other
     alone = jnp.where(to_one == to_one, to_one, to_other)
     return jnp.abs(jnp.where(both == both, both, alone))
+
+
+def _largest(values: Array, least: Array) -> tuple[Array, Array]:
+    """Numbers of the pixels with more than the least value, and how many they are.
+
+    If these are too many, of those with more than twice, four times, ... as much. Blocks of pixels
+    one below the other are looked through: their largest values are quick to find.
+    """
+    height, width = values.shape
+    most = -(-height * width // _SHARE)
+    unit = PIXELS_AT_ONCE if most > PIXELS_AT_ONCE else _FEW
+    places = -(-most // unit) * unit
+    blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
+    blocks = jnp.max(blocks, axis=1).reshape(-1)
+
+    def are_few(found: tuple[Array, Array]) -> Array:
+        return found[1] <= places
+
+    def look(state: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
+        least, (numbers, _) = state
+        order, size = compacted(blocks > least, jnp.arange(blocks.size, dtype=jnp.int32))
+
+        def add(block: Array, exists: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            numbers, total = found
+            first = block // width * _BLOCK * width + block % width
+            number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
+            value = values.reshape(-1).at[number].get(mode="fill", fill_value=0)
+            chosen = exists & (value > least)
+            more, count = compacted(chosen.reshape(-1), number.reshape(-1))
+            return lax.dynamic_update_slice(numbers, more, (total,)), total + count
+
+        start = jnp.zeros_like(numbers), zero_after(size)
+        found = over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
+        return 2 * least, found
+
+    zero = zero_after(blocks[0]).astype(jnp.int32)
+    room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
+    start = least, (room, zero + places + 1)
+    _, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
+    return numbers[:places], total
 
 
 def _faces_at(
@@ -291,7 +294,7 @@ def _put(total: Array, rows: Array, n: Array) -> Array:
 def _of_batch(
     shade: Shade, size: tuple[int, int], inputs: _Inputs, n: Array
 ) -> Float[Array, "some 3"]:
-    """Those of one batch of pixels; zero where the surface ends within one, as edges tell."""
+    """What `_added` finds for one batch: nothing where the surface ends, of which edges tell."""
     data, drawn, turning = inputs
     row, column = jnp.divmod(_taken(turning.number, n), size[1])
     face = _taken(turning.face.T, n).T
