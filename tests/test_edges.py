@@ -175,6 +175,33 @@ def test_what_thin_faces_hide_shows_no_edge():
     np.testing.assert_allclose(image, 1.0, atol=1e-6)
 
 
+@pytest.mark.parametrize(("eye", "error"), [((0.6, -2.2, 1.1), 0.008), ((1.2, 1.8, 0.9), 0.007)])
+def test_where_one_surface_ends_another_may_lie_beyond(eye, error):
+    """A black teapot before a white background: what shows through it would be white."""
+    pot = dr.shapes.teapot(divisions=6)
+    middle = (pot.vertices.min(axis=0) + pot.vertices.max(axis=0)) / 2
+    radius = np.linalg.norm(pot.vertices - middle, axis=1).max()
+    camera = dr.Camera.perspective(
+        eye=middle + radius * np.array(eye),
+        target=middle,
+        up=(0, 0, 1),
+        fov_y=0.8,
+        near=0.1,
+        far=50.0,
+    )
+    black = dr.Material(diffuse=(0, 0, 0), specular=(0, 0, 0), ambient=(0, 0, 0))
+    scene = dr.Scene(
+        objects=[dr.Object(pot, black)],
+        lights=[dr.DirectionalLight(direction=(-1, -1, -2))],
+        background=(1, 1, 1),
+    )
+    image, exact = (
+        dr.render(scene, camera, dr.RenderSettings(height=96, width=96, **options))
+        for options in ({}, {"antialias": False, "samples": 256})
+    )
+    assert np.sqrt(np.mean((image - exact) ** 2)) < error
+
+
 def test_a_face_without_area_does_not_double_the_outline():
     """An octahedron with faces as thin as a line along its outline is as it is without them."""
     turn = np.asarray(dr.linalg.rotation((1.0, 2.0, 3.0), 0.1), np.float64)[:3, :3]

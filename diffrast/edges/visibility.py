@@ -4,8 +4,8 @@ Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 
 those round the edge itself. The first part of the piece is looked at here (see `parts`); what is
 left of it becomes a piece of its own. Faces may be too thin for any pixel to show them: a walk over
 the surface that is seen nearby, and would hide the part if it reached it, tells whether it does.
-Where no candidate lies behind the part, a walk over the surface at the next pixel beyond tells
-which of its faces does, or that it ends before.
+Where no candidate lies behind the part, walks over two surfaces at the pixels around, the one
+beyond first, tell which of their faces does, or that both end before.
 """
 
 from typing import NamedTuple
@@ -243,9 +243,10 @@ def look(
     # Walks over the surface to the point just beyond: from where a surface is seen that would hide
     # the piece if it reached it; and where nothing is found behind, or one is seen that would lie
     # before that, from what is seen beyond or, if that does not fit, from the nearest one that
-    # does. If its surface ends before, nothing else was found, and there are empty pixels not far
-    # away, the background is bare. What hides an edge that is no fold is mostly the other side of
-    # its own body, so its second walk starts from what is seen last before it.
+    # does. If its surface ends before, so does the nearest other one, nothing else was found, and
+    # there are empty pixels not far away, the background is bare. What hides an edge that is no
+    # fold is mostly the other side of its own body, so its second walk starts from what is seen
+    # last before it.
     least = stored(jnp.where(found, nearest * (1 + FINE_TOLERANCE), -jnp.inf))
     after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE)) & (depths > least)
     search = fold & (~found | jnp.any(after, axis=0))
@@ -258,7 +259,9 @@ def look(
     last = _seen_least(crease & before, pictured, depths)
     shown_fits = picked(after, beyond_look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
-    behind = jnp.where(crease, last, behind)
+    behind = stored(jnp.where(crease, last, behind))
+    others = search & after & (patch[:9] != topology.patches[jnp.maximum(behind, 0)])
+    other_behind = _seen_nearest(others, pictured, points[1])
 
     # And two to the point just inside, from pixels that show the surface in front, or another part
     # of it that folds before or behind: where it is not plain that this one comes nearer inwards.
@@ -278,22 +281,24 @@ def look(
     plain = (ours == front) | jnp.any(nearby[:, None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
 
-    ways = jnp.stack([hiding, behind, *jnp.where(alike & ~plain, ours, -1)])
-    away = jnp.stack([outside * out] * 2 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
+    ways = jnp.stack([hiding, behind, other_behind, *jnp.where(alike & ~plain, ours, -1)])
+    away = jnp.stack([outside * out] * 3 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
     ways, (x, y) = stored((jnp.where(visible, ways, -1), (centre + middle)[:, None] + away))
     reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
     arrives = stored(there & (reached >= 0))
     reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
     in_front = reached_depth > near * (1 + FINE_TOLERANCE)
-    touches = ~in_front[2:] & (reached_depth[2:] > near * (1 - FINE_TOLERANCE))
-    connected = plain | (arrives[2:] & (touches | (reached[2:] == front)))
+    touches = ~in_front[3:] & (reached_depth[3:] > near * (1 - FINE_TOLERANCE))
+    connected = plain | (arrives[3:] & (touches | (reached[3:] == front)))
     connected = connected & alike & ~hidden
-    hides = arrives[:2] & (reached[:2] != own[0]) & (reached[:2] != own[1]) & in_front[:2]
-    visible = visible & ~jnp.any(hides, axis=0)
-    lies = search & arrives[1] & ~hides[1] & (reached_depth[1] > least)
-    stops = search & ~found & there[1] & (reached[1] < 0) & (shown >= 0)
+    hides = arrives[:3] & (reached[:3] != own[0]) & (reached[:3] != own[1]) & in_front[:3]
+    visible = visible & ~jnp.any(hides[:2], axis=0)
+    lies = search & arrives[1:3] & ~hides[1:] & (reached_depth[1:3] > least)
+    nearer_lies = lies & (reached_depth[1:3] >= jnp.where(lies, reached_depth[1:3], 0)[::-1])
+    stops = search & ~found & there[1] & (reached[1] < 0) & (shown >= 0) & ~lies[1]
     gap = stops & is_bare_near(bare_blocks, *pieces.pixel)
-    beyond = stored(jnp.where(gap, BACKGROUND, jnp.where(lies, reached[1], beyond)))
+    beyond = jnp.where(nearer_lies[0], reached[1], jnp.where(lies[1], reached[2], beyond))
+    beyond = stored(jnp.where(gap, BACKGROUND, beyond))
     at_beyond = barycentrics(edge_values(corners_of(beyond, faces, pixels), x[1], y[1])[0])
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
