@@ -38,7 +38,7 @@ from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 from diffrast.texture import CubeTexture
 from diffrast.texturing import paint_scene, seams, skybox
-from diffrast.turning import with_turns
+from diffrast.turning import Turning, find_turning, with_turns
 
 
 class Buffers(NamedTuple):
@@ -148,12 +148,18 @@ def render(
         with jax.named_scope("edges"):
             hard = interleaved(color) if held else assemble([stored_alone(c) for c in color])
             topology = scene_topology(scene)
-            image = _with_edges(hard, world, topology, clip, pixels, reached, background, settings)
-        if in_batches:
+            turning = find_turning(face, hard) if in_batches else None
+            image = _with_edges(
+                hard, world, topology, clip, pixels, reached, background, turning, settings
+            )
+        if turning is not None:
             with jax.named_scope("turning"):
                 neighbors = jnp.asarray(topology.neighbors)
                 unshadowed = world._replace(shadows=None)
-                image = with_turns(shader, unshadowed, drawn, face, reached, neighbors, hard, image)
+                fixed = jnp.any(image != hard[1:-1, 1:-1], axis=-1)
+                image = with_turns(
+                    shader, unshadowed, drawn, face, reached, neighbors, turning, fixed, image
+                )
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]
@@ -258,6 +264,7 @@ def _with_edges(
     pixels: Points,
     reached: Reached,
     background: Array,
+    turning: Turning | None,
     settings: RenderSettings,
 ) -> Array:
     geometry = world.geometry
@@ -280,6 +287,7 @@ def _with_edges(
         background=background,
         scene=world,
         cast=cast,
+        meaned=None if turning is None else turning.chosen,
     )
     return antialias_image(
         view,

@@ -2,8 +2,9 @@
 
 A pixel shows the colour at its centre, and edges weigh colours by area. But where a surface curls,
 or has a highlight no larger than a pixel, its colour turns within the pixel. Such pixels, found by
-how colours bend from each to the next ones, are shaded at more points of the surface at their
-centre, and get the mean. Those that edges change have their share already.
+how colours bend from each to the next ones, are shaded at four more points of the surface at their
+centre, and get its mean colour. Those that edges part are shaded at sixteen, as far as nothing
+hides the surface there.
 """
 
 from collections.abc import Callable
@@ -14,16 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from diffrast._device import draws_on_cpu, over_views
 from diffrast._linear import linear_map, linear_zeros
-from diffrast._selection import batches_of, compacted, over_batches
+from diffrast._selection import batches_of, compacted, over_batches, prefix_sum
 from diffrast._stored import stored, zero_after
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.edges.neighborhood import walk
 from diffrast.edges.pieces import facing, to_pixels
-from diffrast.edges.planes import corners_of, covers, edge_values
+from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, pixels_at
@@ -31,25 +32,57 @@ from diffrast.shadows import Reached
 
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
-PIXELS_AT_ONCE = 1024
+PARTS_AT_ONCE = 1024
 _FEW = 128  # of them in small images
 _SHARE = 16  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
-_PLAIN = 0.005  # of the same: what edges may add
 _ROWS = 8  # one of so many tells the mean
 _BLOCK = 16  # pixels, one below the other
 _BLOCKS_AT_ONCE = 64
-# The centre of a pixel, and four points to its right and below it, no two in a row or a column.
-_POINTS = np.array([[0, -1, 3, 1, -3], [0, -3, -1, 3, 1]], np.float32)[:, :, None] / 8
+
+
+def _points() -> np.ndarray:
+    """Where pixels are shaded, to the right of their centres and below, of shape (2, 5 points, 5).
+
+    The centre, and four points, no two in a row or a column, of a whole pixel; then of each quarter
+    of one, of all the points of a grid.
+    """
+    whole = np.array([[-1, 3, 1, -3], [-3, -1, 3, 1]])[:, :, None]
+    corners = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])
+    quarters = corners[:, :, None] + 2 * corners[:, None]
+    points = np.pad(np.concatenate([whole, quarters], axis=2), ((0, 0), (1, 0), (0, 0)))
+    return (points / 8).astype(np.float32)
+
+
+_POINTS = _points()
+_STEEP = abs(_POINTS[1]) >= abs(_POINTS[0])
+_ASIDE = np.where([~_STEEP, _STEEP], np.sign(_POINTS), 0).astype(np.int32)  # the next pixel
 
 
 class Turning(NamedTuple):
-    """The pixels that are shaded at more points, and what is seen there."""
+    """The pixels that are shaded at more points: in the image without its border."""
 
-    number: Int[Array, " places"]  # in the image without its border
+    chosen: Bool[Array, "height width"]
+    number: Int[Array, " places"]
     total: Int[Array, ""]  # of them
-    face: Int[Array, "points places"]  # -1 where the surface ends
+
+
+class _Points(NamedTuple):
+    """What is seen there."""
+
+    number: Int[Array, " places"]
+    moving: Int[Array, ""]  # the first ones, which have a derivative and are shaded as a whole,
+    total: Int[Array, ""]  # and all
+    face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
     reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
+
+
+class _Parts(NamedTuple):
+    """A batch of pixels and quarters of them."""
+
+    place: Int[Array, " some"]
+    exists: Bool[Array, " some"]
+    points: Int[Array, " some"]  # which of `_POINTS`
 
 
 class _Inputs(NamedTuple):
@@ -57,7 +90,17 @@ class _Inputs(NamedTuple):
 
     data: Any
     drawn: Drawn
-    turning: Turning
+    points: _Points
+
+
+def find_turning(
+    face_image: Int[Array, "height_with_border width_with_border"],
+    hard: Float[Array, "height_with_border width_with_border 3"],
+) -> Turning:
+    """The pixels where colours bend most, of an image without edges."""
+    find = over_views(lambda _: _bending, hard.shape[0] * hard.shape[1])
+    found: Turning = find(*lax.stop_gradient((face_image, hard)))
+    return found
 
 
 def with_turns(
@@ -67,7 +110,8 @@ def with_turns(
     face_image: Int[Array, "height_with_border width_with_border"],
     reached: Reached,
     neighbors: Int[Array, "F 3"],
-    hard: Float[Array, "height_with_border width_with_border 3"],
+    turning: Turning,
+    fixed: Bool[Array, "height width"],
     image: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 3"]:
     """An image with the mean colours of pixels in which colours turn.
@@ -82,46 +126,44 @@ def with_turns(
         face_image: the face that each of these pixels sees, -1 for none.
         reached: by each light; images of that size.
         neighbors: of the faces; see `Topology`.
-        hard: that image, without edges.
+        turning: pixels in which colours turn.
+        fixed: pixels that edges part; there what is added has no derivative.
         image: the one with edges, without its border.
     """
     height, width = image.shape[:2]
 
     def found(
+        turning: Turning,
+        fixed: Array,
         face_image: Array,
-        hard: Array,
-        image: Array,
         reached: Reached,
         clip: Array,
         faces: Array,
         neighbors: Array,
-    ) -> Turning:
-        number, count = _bending(face_image, hard, image)
-        face = _faces_at(number, count, face_image, clip, faces, neighbors)
+    ) -> _Points:
+        number, moving = _fixed_last(turning, fixed)
         row, column = jnp.divmod(number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        return Turning(number, count, face, lit)
+        nowhere = jnp.full((_POINTS.shape[1], 4 * number.size), -1, jnp.int32)
+        points = _Points(number, moving, turning.total, nowhere, lit)
+        return points._replace(face=_faces_at(points, face_image, clip, faces, neighbors))
 
-    seen = lax.stop_gradient((face_image, hard, image, reached, drawn.positions_clip))
+    seen = lax.stop_gradient((fixed, face_image, reached, drawn.positions_clip))
     find = over_views(lambda _: found, height * width)
-    turning = find(*seen, drawn.faces, neighbors)
-    added = _added(shade, (height, width), _Inputs(data, drawn, turning))
-    place = jnp.arange(turning.number.size)
-    row, column = jnp.divmod(turning.number, width)
-    row = jnp.where(place < turning.total, row, height + place)  # none twice
+    points = find(turning, *seen, drawn.faces, neighbors)
+    added = _added(shade, (height, width), _Inputs(data, drawn, points))
+    place = jnp.arange(points.number.size)
+    row, column = jnp.divmod(points.number, width)
+    row = jnp.where(place < points.total, row, height + place)  # none twice
     return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
 
-def _bending(face_image: Array, hard: Array, image: Array) -> tuple[Array, Array]:
-    """Numbers of the pixels where colours bend most, and how many they are."""
+def _bending(face_image: Array, hard: Array) -> Turning:
     total = hard[..., 0] + hard[..., 1] + hard[..., 2]
     rows = slice(_ROWS // 2, None, _ROWS)
     some = face_image[rows] >= 0
     mean = jnp.sum(jnp.where(some, abs(total[rows]), 0)) / jnp.maximum(jnp.sum(some), 1)
-    changes = stored(sum(jnp.abs(image[..., c] - hard[1:-1, 1:-1, c]) for c in range(3)))
-    plain = stored(jnp.where(changes <= _PLAIN * mean, 0, jnp.nan))
-    # What the background shows, or an edge changes, is not a number.
-    known = stored(jnp.where(face_image >= 0, total, jnp.nan) + stored(jnp.pad(plain, 1)))
+    known = stored(jnp.where(face_image >= 0, total, jnp.nan))
     middle = known[1:-1, 1:-1]
     across = _bend(known[1:-1, :-2], middle, known[1:-1, 2:])
     down = _bend(known[:-2, 1:-1], middle, known[2:, 1:-1])
@@ -139,15 +181,15 @@ def _bend(one: Array, middle: Array, other: Array) -> Array:
     return jnp.abs(jnp.where(both == both, both, alone))
 
 
-def _largest(values: Array, least: Array) -> tuple[Array, Array]:
-    """Numbers of the pixels with more than the least value, and how many they are.
+def _largest(values: Array, least: Array) -> Turning:
+    """The pixels with more than the least value.
 
     If these are too many, of those with more than twice, four times, ... as much. Blocks of pixels
     one below the other are looked through: their largest values are quick to find.
     """
     height, width = values.shape
     most = -(-height * width // _SHARE)
-    unit = PIXELS_AT_ONCE if most > PIXELS_AT_ONCE else _FEW
+    unit = PARTS_AT_ONCE if most > PARTS_AT_ONCE else _FEW
     places = -(-most // unit) * unit
     blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
     blocks = jnp.max(blocks, axis=1).reshape(-1)
@@ -175,42 +217,91 @@ def _largest(values: Array, least: Array) -> tuple[Array, Array]:
     zero = zero_after(blocks[0]).astype(jnp.int32)
     room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
     start = least, (room, zero + places + 1)
-    _, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    return numbers[:places], total
+    next_, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
+    return Turning(values > next_ / 2, numbers[:places], total)
+
+
+def _fixed_last(turning: Turning, fixed: Array) -> tuple[Array, Array]:
+    """The numbers of pixels, those that are not fixed first; and how many these are."""
+    _, number, total = turning
+    exists = jnp.arange(number.size) < total
+    still = exists & fixed.reshape(-1)[number]
+    moving = prefix_sum((exists & ~still).astype(jnp.int32))
+    count = moving[-1]
+    place = jnp.where(still, count + prefix_sum(still.astype(jnp.int32)), moving) - 1
+    place = jnp.where(exists, place, number.size)
+    return jnp.zeros_like(number).at[place].set(number, mode="drop"), count
+
+
+def _count(points: _Points) -> Array:
+    """Of all parts of pixels."""
+    return points.moving + 4 * (points.total - points.moving)
+
+
+def _at_once(points: _Points) -> int:
+    places = points.number.size
+    return min(places, PARTS_AT_ONCE) if draws_on_cpu() else places
+
+
+def _parts(points: _Points, n: Array, count: Array) -> _Parts:
+    """The batch `n` of so many parts."""
+    size = _at_once(points)
+    number = n * size + jnp.arange(size, dtype=jnp.int32)
+    after = number - points.moving
+    whole = after < 0
+    place = jnp.where(whole, number, points.moving + after // 4)
+    place = jnp.minimum(place, points.number.size - 1)
+    return _Parts(*stored((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
+
+
+def _over_parts(
+    points: _Points, count: Array, step: Callable[[Array, Any], Any], start: Any
+) -> Any:
+    return lax.fori_loop(0, batches_of(count, _at_once(points)), step, start)
 
 
 def _faces_at(
-    number: Array, count: Array, face_image: Array, clip: Array, faces: Array, neighbors: Array
-) -> Int[Array, "points places"]:
-    """The faces at the points of pixels, found from those at their centres."""
+    points: _Points, face_image: Array, clip: Array, faces: Array, neighbors: Array
+) -> Int[Array, "points parts"]:
+    """The faces at the points of pixels, found from those at their centres.
+
+    What the next pixels show may hide them.
+    """
     height, width = face_image.shape
+    count = _count(points)
 
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
         volume = facing(pixels, faces)
 
-        def add(place: Array, exists: Array, found: Array) -> Array:
-            row, column = stored(jnp.divmod(number[place], width - 2))
+        def add(n: Array, found: Array) -> Array:
+            place, exists, part = _parts(points, n, count)
+            row, column = stored(jnp.divmod(points.number[place], width - 2))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
-            x, y = column + 1.5 + _POINTS[0], row + 1.5 + _POINTS[1]
-            x, y = stored((x.astype(clip.dtype), y.astype(clip.dtype)))
+            right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
+            x, y = stored((column + 1.5 + right, row + 1.5 + down))
             own = jnp.broadcast_to(centre, x.shape)
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
-            ways = stored(jnp.where(covered, -1, own))
-            end, there = walk(ways, x, y, faces, pixels, neighbors, volume)
-            return found.at[:, place].set(jnp.where(covered, own, jnp.where(there, end, -1)))
+            right, down = jnp.asarray(_ASIDE)[:, :, part]
+            beside = face_image[row + 1 + down, column + 1 + right]
+            beside = jnp.where(exists & (part > 0) & (beside != own), beside, -1)
+            starts = stored(jnp.concatenate([jnp.where(covered, -1, own), beside]))
+            both = jnp.tile(x, (2, 1)), jnp.tile(y, (2, 1))
+            ends, there = walk(starts, *both, faces, pixels, neighbors, volume)
+            inner, outer = stored(jnp.where(there, ends, -1)).reshape(2, *x.shape)
+            inner = jnp.where(covered, own, inner)
+            near, far = (
+                edge_values(corners_of(end, faces, pixels), x, y)[1] for end in (outer, inner)
+            )
+            hidden = (outer >= 0) & (near > far * (1 + FINE_TOLERANCE))
+            inner = stored(jnp.where(hidden, -1, inner))
+            return lax.dynamic_update_slice_in_dim(found, inner, n * place.size, 1)
 
-        places = jnp.arange(number.size, dtype=jnp.int32)
-        return over_batches(places, count, _at_once(number.size), add, found)
+        return _over_parts(points, count, add, found)
 
-    nothing = jnp.full((_POINTS.shape[1], number.size), -1, jnp.int32)
-    nothing = nothing + varying_zero((number, face_image, clip, faces, neighbors))
+    nothing = points.face + varying_zero((points, face_image, clip, faces, neighbors))
     return lax.cond(count > 0, find, lambda nothing: nothing, nothing)
-
-
-def _at_once(places: int) -> int:
-    return min(places, PIXELS_AT_ONCE) if draws_on_cpu() else places
 
 
 def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array, "places 3"]:
@@ -222,48 +313,61 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
     @jax.custom_jvp
     def added(inputs: _Inputs) -> Array:
         def all_batches(inputs: _Inputs) -> Array:
-            def step(n: Array, total: Array) -> Array:
-                return _put(total, stored(_of_batch(shade, size, inputs, n)), n)
+            points = inputs.points
+            count = _count(points)
 
-            return _over_turning(inputs, step, _nothing(inputs) + varying_zero(inputs))
+            def step(n: Array, total: Array) -> Array:
+                parts = _parts(points, n, count)
+                rows = stored(_of_parts(shade, size, inputs, parts, n))
+                return total.at[parts.place].add(rows)
+
+            return _over_parts(points, count, step, _nothing(inputs) + varying_zero(inputs))
 
         return over(all_batches)(varying_alike(inputs))
 
     def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
         leaves, tree = jax.tree.flatten(varying_alike(lax.stop_gradient(primals[0])))
         changes = jax.tree.leaves(tangents[0])
-        moving = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
+        used = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
 
-        def of_moving(leaves: list[Array], n: Array) -> Callable[..., Array]:
+        def of_used(leaves: list[Array], n: Array) -> tuple[Array, Callable[..., Array]]:
+            points = jax.tree.unflatten(tree, leaves).points
+            parts = _parts(points, n, points.moving)
+
             def of(*values: Array) -> Array:
-                given = dict(zip(moving, values, strict=True))
-                parts = [given.get(i, leaf) for i, leaf in enumerate(leaves)]
-                return _of_batch(shade, size, jax.tree.unflatten(tree, parts), n)
+                given = dict(zip(used, values, strict=True))
+                both = [given.get(i, leaf) for i, leaf in enumerate(leaves)]
+                return _of_parts(shade, size, jax.tree.unflatten(tree, both), parts, n)
 
-            return of
+            return parts.place, of
+
+        def over_moving(leaves: list[Array], step: Callable[[Array, Any], Any], start: Any) -> Any:
+            points = jax.tree.unflatten(tree, leaves).points
+            return _over_parts(points, points.moving, step, start)
 
         def push(leaves: list[Array], changes: list[Array], nothing: Array) -> Array:
-            at = [leaves[i] for i in moving]
+            at = [leaves[i] for i in used]
 
             def step(n: Array, total: Array) -> Array:
-                return _put(total, jax.jvp(of_moving(leaves, n), at, changes)[1], n)
+                place, of = of_used(leaves, n)
+                return total.at[place].add(jax.jvp(of, at, changes)[1])
 
-            return _over_turning(jax.tree.unflatten(tree, leaves), step, nothing)
+            return over_moving(leaves, step, nothing)
 
         def pull(leaves: list[Array], cotangent: Array) -> list[Array]:
-            at = [leaves[i] for i in moving]
+            at = [leaves[i] for i in used]
 
             def step(n: Array, total: list[Array]) -> list[Array]:
-                back = jax.vjp(of_moving(leaves, n), *at)[1]
-                return jax.tree.map(jnp.add, total, list(back(_taken(cotangent, n))))
+                place, of = of_used(leaves, n)
+                back = jax.vjp(of, *at)[1]
+                return jax.tree.map(jnp.add, total, list(back(cotangent[place])))
 
-            nothing = [linear_zeros(leaf.shape, cotangent) for leaf in at]
-            return _over_turning(jax.tree.unflatten(tree, leaves), step, nothing)
+            return over_moving(leaves, step, [linear_zeros(leaf.shape, cotangent) for leaf in at])
 
         change = linear_map(
             lambda changes, nothing: over(push)(leaves, changes, nothing),
             lambda cotangent: over(pull)(leaves, cotangent),
-            [changes[i] for i in moving],
+            [changes[i] for i in used],
             _nothing(primals[0]),
         )
         return added(*primals), change
@@ -273,38 +377,26 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
 
 
 def _nothing(inputs: _Inputs) -> Array:
-    return jnp.zeros((inputs.turning.number.size, 3), inputs.drawn.positions_clip.dtype)
+    return jnp.zeros((inputs.points.number.size, 3), inputs.drawn.positions_clip.dtype)
 
 
-def _over_turning(inputs: _Inputs, step: Callable[[Array, Any], Any], start: Any) -> Any:
-    turning = inputs.turning
-    batches = batches_of(turning.total, _at_once(turning.number.size))
-    return lax.fori_loop(0, batches, step, start)
-
-
-def _taken(rows: Array, n: Array) -> Array:
-    at_once = _at_once(rows.shape[0])
-    return lax.dynamic_slice_in_dim(rows, n * at_once, at_once)
-
-
-def _put(total: Array, rows: Array, n: Array) -> Array:
-    return lax.dynamic_update_slice_in_dim(total, rows, n * rows.shape[0], 0)
-
-
-def _of_batch(
-    shade: Shade, size: tuple[int, int], inputs: _Inputs, n: Array
+def _of_parts(
+    shade: Shade, size: tuple[int, int], inputs: _Inputs, parts: _Parts, n: Array
 ) -> Float[Array, "some 3"]:
-    """What `_added` finds for one batch: nothing where the surface ends, of which edges tell."""
-    data, drawn, turning = inputs
-    row, column = jnp.divmod(_taken(turning.number, n), size[1])
-    face = _taken(turning.face.T, n).T
+    """What `_added` finds for parts of the batch `n`: of what is not seen, edges tell."""
+    data, drawn, points = inputs
+    row, column = jnp.divmod(points.number[parts.place], size[1])
+    some = row.size
+    face = lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
     full = size[0] + 2, size[1] + 2
     pixels = pixels_at(face, row + 1, column + 1, full, drawn.positions_clip.dtype)
-    x, y = pixels.x + 2 * _POINTS[0], pixels.y - 2 * _POINTS[1]
-    seen, x, y = stored([part.reshape(-1) for part in (face, x, y)])
-    lit = jax.tree.map(lambda part: jnp.tile(_taken(part, n), face.shape[0]), turning.reached)
-    points = points_at(drawn, pixels._replace(face=seen, x=x, y=y))
-    colors = [color.reshape(face.shape) for color in shade(data, points, lit)]
-    known = jnp.min(face, axis=0) >= 0
-    means = [jnp.mean(color[1:], axis=0) - color[0] for color in colors]
-    return jnp.stack([jnp.where(known, mean, 0) for mean in means], axis=-1)
+    right, down = jnp.asarray(_POINTS)[:, :, parts.points]
+    x, y = pixels.x + 2 * right, pixels.y - 2 * down
+    flat, x, y = stored([part.reshape(-1) for part in (face, x, y)])
+    lit = jax.tree.map(lambda part: jnp.tile(part[parts.place], face.shape[0]), points.reached)
+    seen = points_at(drawn, pixels._replace(face=flat, x=x, y=y))
+    colors = [color.reshape(face.shape) for color in shade(data, seen, lit)]
+    used = (face[1:] >= 0) & parts.exists
+    share = jnp.where(parts.points > 0, 0.25, 1)  # of the pixel
+    means = [jnp.mean(jnp.where(used, color[1:] - color[0], 0), axis=0) for color in colors]
+    return jnp.stack([share * mean for mean in means], axis=-1)

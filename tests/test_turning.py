@@ -66,19 +66,20 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
 
     def watched(shade, size, inputs):
         found.append((shade, size, inputs))
-        return jnp.zeros((inputs.turning.number.size, 3))
+        return jnp.zeros((inputs.points.number.size, 3))
 
     added = turning._added
     with monkeypatch.context() as patch:
         patch.setattr(turning, "_added", watched)
-        patch.setattr(turning, "PIXELS_AT_ONCE", 32)
+        patch.setattr(turning, "PARTS_AT_ONCE", 32)
         patch.setattr(turning, "_FEW", 32)
         dr.render.__wrapped__(scene(), camera(), settings(40))
         ((shade, size, inputs),) = found
-        assert 32 < inputs.turning.total <= inputs.turning.number.size
+        points = inputs.points
+        assert 32 < points.moving < points.total <= points.number.size
 
         def colors(vertices, direction, at_once):
-            patch.setattr(turning, "PIXELS_AT_ONCE", at_once)
+            patch.setattr(turning, "PARTS_AT_ONCE", at_once)
             attributes = (vertices, *inputs.drawn.attributes[1:])
             (light,) = inputs.data.scene.lights
             placed = inputs.drawn.placed._replace(attributes=attributes)
@@ -92,12 +93,13 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         rng = np.random.default_rng(0)
         at = inputs.drawn.attributes[0], jnp.array([-1.0, -1, -2])
         way = tuple(jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in at)
-        places = inputs.turning.number.size
-        used = (jnp.arange(places) < inputs.turning.total)[:, None]
+        places = points.number.size
+        used = (jnp.arange(places) < points.moving)[:, None]  # the others have no derivative
 
         def in_one_go(*values):
-            whole = colors(*values, places)
-            return used * turning._of_batch(shade, size, whole, jnp.zeros((), jnp.int32))
+            whole, first = colors(*values, places), jnp.zeros((), jnp.int32)
+            parts = turning._parts(points, first, points.moving)
+            return turning._of_parts(shade, size, whole, parts, first)
 
         def in_batches(*values):
             return added(shade, size, colors(*values, 32))
@@ -106,7 +108,7 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         got, change = jax.jvp(in_batches, at, way)
         np.testing.assert_allclose(used * got, want, atol=5e-5)
         scale = np.abs(want_change).max()
-        np.testing.assert_allclose(used * change, want_change, atol=1e-3 * scale)
+        np.testing.assert_allclose(change, want_change, atol=1e-3 * scale)
         weight = used * jnp.asarray(rng.normal(size=want.shape), jnp.float32)
         pulled, others = (jax.vjp(f, *at)[1](weight) for f in (in_batches, in_one_go))
         for ours, theirs in zip(pulled, others, strict=True):

@@ -49,6 +49,8 @@ class View(NamedTuple):
     scene: Any  # passed on to the shader
     scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
+    # Pixels that get the mean colour of the surface at their centre elsewhere.
+    meaned: Bool[Array, "height width"] | None = None
     unseen: Int[Array, " pixels"] | None = None  # see `Sums`
 
 
@@ -223,8 +225,13 @@ def with_pieces(
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
         turn = length * (integral - jnp.mean(rim.reaches, axis=0) * near)
-        value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         own = _colors(view.image, centre)
+        value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
+        if view.meaned is not None:
+            meaned = stored(view.meaned.reshape(-1)[_number(view, pieces.pixel)])
+            first, second = (meaned & side.is_centre for side in (found.front, found.beyond))
+            value = jnp.where(first, area * (behind - own), value)
+            value = jnp.where(second, value + area * (own - behind), value)
         value = jnp.where(found.wrong_side, value + front - own, value)
     jump, value, front, behind = stored((jump, value, front, behind))
     size = reduce(jnp.maximum, jnp.abs(behind) + jnp.abs(front))

@@ -63,6 +63,7 @@ class Side(NamedTuple):
     face: Int[Array, " n"]  # shaded at `barycentrics`; -1: as the pixel `look`; or BACKGROUND
     barycentrics: Columns
     look: Int[Array, " n"]  # 0 to 8: pixel of the 3×3 whose colour changes as this side's
+    is_centre: Bool[Array, " n"]  # whether the pixel's centre shows this surface
 
 
 class Seen(NamedTuple):
@@ -329,6 +330,11 @@ def look(
         volume,
     )
 
+    # Which side is what the pixel shows at its centre.
+    is_front = (front_shown == 4) & (patch[4] == front_patch) & (pictured[4] >= 0)
+    alike = (beyond == -1) | (patch[4] == topology.patches[jnp.maximum(beyond, 0)])
+    is_beyond = (beyond_look == 4) & (pictured[4] >= 0) & (beyond != BACKGROUND) & alike
+
     # A flap of a curved surface, narrower than a pixel, in front of that surface itself.
     same = picked(patch, beyond_look) == front_patch
     flap = fold & ~rim.smooth & (beyond == -1) & same
@@ -336,9 +342,9 @@ def look(
         visible=visible & ~flap,
         fold=fold,
         front_on_right=front_on_right,
-        front=Side(front, on_edge(front_corners, s), front_shown),
+        front=Side(front, on_edge(front_corners, s), front_shown, is_front),
         unseen=first_row(pictured == front) == 9,
-        beyond=Side(beyond, at_beyond, beyond_look),
+        beyond=Side(beyond, at_beyond, beyond_look, is_beyond & ~is_front),
         rim=rim,
         wrong_side=wrong_side,
         centre_depth=centre_depth,
