@@ -148,17 +148,16 @@ def render(
         with jax.named_scope("edges"):
             hard = interleaved(color) if held else assemble([stored_alone(c) for c in color])
             topology = scene_topology(scene)
+            apart = _apart(world, topology, settings)
             turning = find_turning(face, hard) if in_batches else None
             image = _with_edges(
-                hard, world, topology, clip, pixels, reached, background, turning, settings
+                hard, world, topology, apart, clip, pixels, reached, background, turning, settings
             )
         if turning is not None:
             with jax.named_scope("turning"):
-                neighbors = jnp.asarray(topology.neighbors)
                 unshadowed = world._replace(shadows=None)
-                fixed = jnp.any(image != hard[1:-1, 1:-1], axis=-1)
                 image = with_turns(
-                    shader, unshadowed, drawn, face, reached, neighbors, turning, fixed, image
+                    shader, unshadowed, drawn, face, reached, topology, apart, turning, hard, image
                 )
         if side == 1:
             return image
@@ -256,10 +255,21 @@ def _check_kinds(scene: Scene, camera: Camera, settings: RenderSettings) -> None
     instance_of("settings", settings, RenderSettings)
 
 
+def _apart(world: World, topology: Topology, settings: RenderSettings) -> Array:
+    """The edges between two faces in view across which colours may jump."""
+    apart = apart_edges(world.geometry, topology.edges, settings.shading)
+    if settings.shading != "flat" and world.shadows is not None:
+        apart = apart | terminators(world.shadows, topology.edges)
+    if world.paints:
+        apart = apart | seams(world.scene, world.paints, topology.edges)
+    return apart
+
+
 def _with_edges(
     image: Array,
     world: World,
     topology: Topology,
+    apart: Array,
     positions_clip: Array,
     pixels: Points,
     reached: Reached,
@@ -269,13 +279,8 @@ def _with_edges(
 ) -> Array:
     geometry = world.geometry
     cast = cast_outlines(world, topology, pixels, reached)
-    apart = apart_edges(geometry, topology.edges, settings.shading)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
-    elif world.shadows is not None:
-        apart = apart | terminators(world.shadows, topology.edges)
-    if world.paints:
-        apart = apart | seams(world.scene, world.paints, topology.edges)
     view = View(
         positions_clip=positions_clip,
         faces=geometry.faces,

@@ -21,6 +21,7 @@ from diffrast._device import draws_on_cpu, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of, compacted, over_batches, prefix_sum
 from diffrast._stored import stored, zero_after
+from diffrast._topology import Topology
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.edges.neighborhood import walk
 from diffrast.edges.pieces import facing, to_pixels
@@ -34,8 +35,9 @@ Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
 PARTS_AT_ONCE = 1024
 _FEW = 128  # of them in small images
-_SHARE = 16  # of so many pixels at most one is shaded at more points
+_SHARE = 8  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
+_PLAIN = 0.005  # of the same: what edges may add where they part nothing
 _ROWS = 8  # one of so many tells the mean
 _BLOCK = 16  # pixels, one below the other
 _BLOCKS_AT_ONCE = 64
@@ -60,11 +62,10 @@ _ASIDE = np.where([~_STEEP, _STEEP], np.sign(_POINTS), 0).astype(np.int32)  # th
 
 
 class Turning(NamedTuple):
-    """The pixels that are shaded at more points: in the image without its border."""
+    """What the picture without edges tells of where colours turn."""
 
-    chosen: Bool[Array, "height width"]
-    number: Int[Array, " places"]
-    total: Int[Array, ""]  # of them
+    chosen: Bool[Array, "height width"]  # pixels that get their surface's mean colour in any case
+    mean: Float[Array, ""]  # colour of the whole picture
 
 
 class _Points(NamedTuple):
@@ -97,9 +98,23 @@ def find_turning(
     face_image: Int[Array, "height_with_border width_with_border"],
     hard: Float[Array, "height_with_border width_with_border 3"],
 ) -> Turning:
-    """The pixels where colours bend most, of an image without edges."""
-    find = over_views(lambda _: _bending, hard.shape[0] * hard.shape[1])
-    found: Turning = find(*lax.stop_gradient((face_image, hard)))
+    """Where colours bend most in an image without edges: at no more than one of 16 pixels."""
+
+    def find(face_image: Array, hard: Array) -> Turning:
+        color = _sums(hard)
+        some = slice(_ROWS // 2, None, _ROWS)
+        seen = face_image[some] >= 0
+        mean = jnp.sum(jnp.where(seen, abs(color[some]), 0)) / jnp.maximum(jnp.sum(seen), 1)
+        bends = _bends(jnp.where(face_image >= 0, color, jnp.nan))
+
+        def are_many(least: Array) -> Array:
+            return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
+
+        least = lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
+        return Turning(bends > least, mean)
+
+    seen = lax.stop_gradient((face_image, hard))
+    found: Turning = over_views(lambda _: find, face_image.size)(*seen)
     return found
 
 
@@ -109,15 +124,16 @@ def with_turns(
     drawn: Drawn,
     face_image: Int[Array, "height_with_border width_with_border"],
     reached: Reached,
-    neighbors: Int[Array, "F 3"],
+    topology: Topology,
+    apart: Bool[Array, " edges"],
     turning: Turning,
-    fixed: Bool[Array, "height width"],
+    hard: Float[Array, "height_with_border width_with_border 3"],
     image: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 3"]:
     """An image with the mean colours of pixels in which colours turn.
 
     Differentiable as the image itself and as the colours are, but for second derivatives of what is
-    added.
+    added; that has none where edges part pixels, which have their derivative already.
 
     Args:
         shade: colours of points, one array a channel; its first argument is `data`.
@@ -125,32 +141,36 @@ def with_turns(
         drawn: what is drawn, in an image with a border of one pixel all round.
         face_image: the face that each of these pixels sees, -1 for none.
         reached: by each light; images of that size.
-        neighbors: of the faces; see `Topology`.
-        turning: pixels in which colours turn.
-        fixed: pixels that edges part; there what is added has no derivative.
+        topology: of the faces.
+        apart: whether colours may jump across an edge.
+        turning: what `find_turning` found; the edges know of the pixels chosen there.
+        hard: that image, without edges.
         image: the one with edges, without its border.
     """
     height, width = image.shape[:2]
 
-    def found(
+    def find(
         turning: Turning,
-        fixed: Array,
         face_image: Array,
+        hard: Array,
+        image: Array,
         reached: Reached,
         clip: Array,
         faces: Array,
-        neighbors: Array,
+        topology: Topology,
+        apart: Array,
     ) -> _Points:
-        number, moving = _fixed_last(turning, fixed)
+        number, moving, total = _bending(turning, face_image, hard, image)
         row, column = jnp.divmod(number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        nowhere = jnp.full((_POINTS.shape[1], 4 * number.size), -1, jnp.int32)
-        points = _Points(number, moving, turning.total, nowhere, lit)
-        return points._replace(face=_faces_at(points, face_image, clip, faces, neighbors))
+        nowhere = jnp.full((_POINTS.shape[1], 2 * number.size), -1, jnp.int32)
+        points = _Points(number, moving, total, nowhere, lit)
+        found = _faces_at(points, face_image, clip, faces, topology, apart)
+        return points._replace(face=found)
 
-    seen = lax.stop_gradient((fixed, face_image, reached, drawn.positions_clip))
-    find = over_views(lambda _: found, height * width)
-    points = find(turning, *seen, drawn.faces, neighbors)
+    seen = lax.stop_gradient((turning, face_image, hard, image, reached, drawn.positions_clip))
+    surface = jax.tree.map(jnp.asarray, topology), apart
+    points = over_views(lambda _: find, height * width)(*seen, drawn.faces, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     place = jnp.arange(points.number.size)
     row, column = jnp.divmod(points.number, width)
@@ -158,19 +178,51 @@ def with_turns(
     return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
 
-def _bending(face_image: Array, hard: Array) -> Turning:
-    total = hard[..., 0] + hard[..., 1] + hard[..., 2]
-    rows = slice(_ROWS // 2, None, _ROWS)
-    some = face_image[rows] >= 0
-    mean = jnp.sum(jnp.where(some, abs(total[rows]), 0)) / jnp.maximum(jnp.sum(some), 1)
-    known = stored(jnp.where(face_image >= 0, total, jnp.nan))
-    middle = known[1:-1, 1:-1]
-    across = _bend(known[1:-1, :-2], middle, known[1:-1, 2:])
-    down = _bend(known[:-2, 1:-1], middle, known[2:, 1:-1])
+def _sums(image: Array) -> Array:
+    return image[..., 0] + image[..., 1] + image[..., 2]
+
+
+def _least(mean: Array) -> Array:
+    """Of what is chosen; doubled, it must not stay zero."""
+    return jnp.maximum(_BEND * mean, jnp.finfo(mean.dtype).tiny)
+
+
+def _places(image: Array) -> int:
+    """For how many pixels of an image there is room."""
+    most = -(-image.size // _SHARE)
+    unit = PARTS_AT_ONCE if most > PARTS_AT_ONCE else _FEW
+    return -(-most // unit) * unit
+
+
+def _bending(
+    turning: Turning, face_image: Array, hard: Array, image: Array
+) -> tuple[Array, Array, Array]:
+    """Numbers of the pixels where colours bend most, those that edges part last.
+
+    Also how many are before these, and how many they are in all.
+    """
+    changes = stored(_sums(jnp.abs(image - hard[1:-1, 1:-1])))
+    parted = stored(changes > _PLAIN * turning.mean)
+    # What the background shows, or an edge changes, is not a number.
+    color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
+    bends = stored(jnp.where(turning.chosen, jnp.inf, _bends(color)))
+    number, total = _largest(bends, _least(turning.mean))
+    exists = jnp.arange(number.size) < total
+    last = exists & parted.reshape(-1)[number]
+    ends = prefix_sum((exists & ~last).astype(jnp.int32))
+    place = jnp.where(last, ends[-1] + prefix_sum(last.astype(jnp.int32)), ends) - 1
+    place = jnp.where(exists, place, number.size)
+    return jnp.zeros_like(number).at[place].set(number, mode="drop"), ends[-1], total
+
+
+def _bends(color: Array) -> Array:
+    """By how much more colours change to one side of each pixel but those at the border."""
+    color = stored(color)
+    middle = color[1:-1, 1:-1]
+    across = _bend(color[1:-1, :-2], middle, color[1:-1, 2:])
+    down = _bend(color[:-2, 1:-1], middle, color[2:, 1:-1])
     bends = jnp.fmax(across, down)
-    bends = stored(jnp.where(bends == bends, bends, 0))
-    least = jnp.maximum(_BEND * mean, jnp.finfo(mean.dtype).tiny)  # doubled, it must not stay zero
-    return _largest(bends, least)
+    return stored(jnp.where(bends == bends, bends, 0))
 
 
 def _bend(one: Array, middle: Array, other: Array) -> Array:
@@ -181,16 +233,14 @@ def _bend(one: Array, middle: Array, other: Array) -> Array:
     return jnp.abs(jnp.where(both == both, both, alone))
 
 
-def _largest(values: Array, least: Array) -> Turning:
-    """The pixels with more than the least value.
+def _largest(values: Array, least: Array) -> tuple[Array, Array]:
+    """Numbers of the pixels with more than the least value, and how many they are.
 
     If these are too many, of those with more than twice, four times, ... as much. Blocks of pixels
     one below the other are looked through: their largest values are quick to find.
     """
     height, width = values.shape
-    most = -(-height * width // _SHARE)
-    unit = PARTS_AT_ONCE if most > PARTS_AT_ONCE else _FEW
-    places = -(-most // unit) * unit
+    places = _places(values)
     blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
     blocks = jnp.max(blocks, axis=1).reshape(-1)
 
@@ -217,25 +267,19 @@ def _largest(values: Array, least: Array) -> Turning:
     zero = zero_after(blocks[0]).astype(jnp.int32)
     room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
     start = least, (room, zero + places + 1)
-    next_, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    return Turning(values > next_ / 2, numbers[:places], total)
+    _, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
+    return numbers[:places], total
 
 
-def _fixed_last(turning: Turning, fixed: Array) -> tuple[Array, Array]:
-    """The numbers of pixels, those that are not fixed first; and how many these are."""
-    _, number, total = turning
-    exists = jnp.arange(number.size) < total
-    still = exists & fixed.reshape(-1)[number]
-    moving = prefix_sum((exists & ~still).astype(jnp.int32))
-    count = moving[-1]
-    place = jnp.where(still, count + prefix_sum(still.astype(jnp.int32)), moving) - 1
-    place = jnp.where(exists, place, number.size)
-    return jnp.zeros_like(number).at[place].set(number, mode="drop"), count
+def _parts_of_each(points: _Points) -> Array:
+    """In how many parts those pixels are shaded that edges part: in four, if there is room."""
+    quarters = points.moving + 4 * (points.total - points.moving)
+    return jnp.where(quarters <= points.face.shape[1], 4, 1)
 
 
 def _count(points: _Points) -> Array:
     """Of all parts of pixels."""
-    return points.moving + 4 * (points.total - points.moving)
+    return points.moving + _parts_of_each(points) * (points.total - points.moving)
 
 
 def _at_once(points: _Points) -> int:
@@ -248,7 +292,8 @@ def _parts(points: _Points, n: Array, count: Array) -> _Parts:
     size = _at_once(points)
     number = n * size + jnp.arange(size, dtype=jnp.int32)
     after = number - points.moving
-    whole = after < 0
+    each = _parts_of_each(points)
+    whole = (after < 0) | (each == 1)
     place = jnp.where(whole, number, points.moving + after // 4)
     place = jnp.minimum(place, points.number.size - 1)
     return _Parts(*stored((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
@@ -261,7 +306,12 @@ def _over_parts(
 
 
 def _faces_at(
-    points: _Points, face_image: Array, clip: Array, faces: Array, neighbors: Array
+    points: _Points,
+    face_image: Array,
+    clip: Array,
+    faces: Array,
+    topology: Topology,
+    apart: Array,
 ) -> Int[Array, "points parts"]:
     """The faces at the points of pixels, found from those at their centres.
 
@@ -273,6 +323,7 @@ def _faces_at(
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
         volume = facing(pixels, faces)
+        neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
 
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(points, n, count)
@@ -285,7 +336,7 @@ def _faces_at(
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             right, down = jnp.asarray(_ASIDE)[:, :, part]
             beside = face_image[row + 1 + down, column + 1 + right]
-            beside = jnp.where(exists & (part > 0) & (beside != own), beside, -1)
+            beside = jnp.where(exists & (place >= points.moving) & (beside != own), beside, -1)
             starts = stored(jnp.concatenate([jnp.where(covered, -1, own), beside]))
             both = jnp.tile(x, (2, 1)), jnp.tile(y, (2, 1))
             ends, there = walk(starts, *both, faces, pixels, neighbors, volume)
@@ -300,8 +351,21 @@ def _faces_at(
 
         return _over_parts(points, count, add, found)
 
-    nothing = points.face + varying_zero((points, face_image, clip, faces, neighbors))
+    nothing = points.face + varying_zero((points, face_image, clip, faces, topology, apart))
     return lax.cond(count > 0, find, lambda nothing: nothing, nothing)
+
+
+def _together(topology: Topology, apart: Array) -> Array:
+    return topology.neighbors + varying_zero((topology, apart))
+
+
+def _parted(topology: Topology, apart: Array) -> Array:
+    """The neighbours of faces, but none across these edges."""
+    corners, count = topology.edges.corners, topology.neighbors.shape[0]
+    side = 3 - corners // 3 - corners % 3
+    face = jnp.where(apart[:, None], topology.edges.faces, -1)
+    face = jnp.where(face >= 0, face, count)
+    return _together(topology, apart).at[face, side].set(-1, mode="drop")
 
 
 def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array, "places 3"]:
