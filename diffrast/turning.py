@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._device import draws_on_cpu, over_views
 from diffrast._linear import linear_map, linear_zeros
-from diffrast._selection import batches_of, compacted, over_batches, prefix_sum
+from diffrast._selection import batches_of, compacted, over_batches
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast._varying import varying_alike, varying_zero
@@ -31,11 +31,12 @@ from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, pixels_at
 from diffrast.shadows import Reached
 
+_Lists: TypeAlias = tuple[Array, Array, Array, Array]
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
 PARTS_AT_ONCE = 1024
 _FEW = 128  # of them in small images
-_SHARE = 8  # of so many pixels at most one is shaded at more points
+_SHARE = 10  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
 _PLAIN = 0.005  # of the same: what edges may add where they part nothing
 _ROWS = 8  # one of so many tells the mean
@@ -68,12 +69,18 @@ class Turning(NamedTuple):
     mean: Float[Array, ""]  # colour of the whole picture
 
 
-class _Points(NamedTuple):
-    """What is seen there."""
+class _Chosen(NamedTuple):
+    """The pixels that are shaded at more points."""
 
     number: Int[Array, " places"]
     moving: Int[Array, ""]  # the first ones, which have a derivative and are shaded as a whole,
     total: Int[Array, ""]  # and all
+
+
+class _Points(NamedTuple):
+    """What is seen there."""
+
+    chosen: _Chosen
     face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
     reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
 
@@ -98,7 +105,7 @@ def find_turning(
     face_image: Int[Array, "height_with_border width_with_border"],
     hard: Float[Array, "height_with_border width_with_border 3"],
 ) -> Turning:
-    """Where colours bend most in an image without edges: at no more than one of 16 pixels."""
+    """Where colours bend most in an image without edges: at no more than one of 20 pixels."""
 
     def find(face_image: Array, hard: Array) -> Turning:
         color = _sums(hard)
@@ -160,21 +167,19 @@ def with_turns(
         topology: Topology,
         apart: Array,
     ) -> _Points:
-        number, moving, total = _bending(turning, face_image, hard, image)
-        row, column = jnp.divmod(number, width)
+        chosen = _bending(turning, face_image, hard, image)
+        row, column = jnp.divmod(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        nowhere = jnp.full((_POINTS.shape[1], 2 * number.size), -1, jnp.int32)
-        points = _Points(number, moving, total, nowhere, lit)
-        found = _faces_at(points, face_image, clip, faces, topology, apart)
-        return points._replace(face=found)
+        return _Points(chosen, _faces_at(chosen, face_image, clip, faces, topology, apart), lit)
 
     seen = lax.stop_gradient((turning, face_image, hard, image, reached, drawn.positions_clip))
     surface = jax.tree.map(jnp.asarray, topology), apart
     points = over_views(lambda _: find, height * width)(*seen, drawn.faces, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
-    place = jnp.arange(points.number.size)
-    row, column = jnp.divmod(points.number, width)
-    row = jnp.where(place < points.total, row, height + place)  # none twice
+    number, _, total = points.chosen
+    place = jnp.arange(number.size)
+    row, column = jnp.divmod(number, width)
+    row = jnp.where(place < total, row, height + place)  # none twice
     return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
 
@@ -194,25 +199,34 @@ def _places(image: Array) -> int:
     return -(-most // unit) * unit
 
 
-def _bending(
-    turning: Turning, face_image: Array, hard: Array, image: Array
-) -> tuple[Array, Array, Array]:
-    """Numbers of the pixels where colours bend most, those that edges part last.
-
-    Also how many are before these, and how many they are in all.
-    """
+def _bending(turning: Turning, face_image: Array, hard: Array, image: Array) -> _Chosen:
+    """Those where colours bend most."""
     changes = stored(_sums(jnp.abs(image - hard[1:-1, 1:-1])))
     parted = stored(changes > _PLAIN * turning.mean)
     # What the background shows, or an edge changes, is not a number.
     color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
     bends = stored(jnp.where(turning.chosen, jnp.inf, _bends(color)))
     number, total = _largest(bends, _least(turning.mean))
-    exists = jnp.arange(number.size) < total
-    last = exists & parted.reshape(-1)[number]
-    ends = prefix_sum((exists & ~last).astype(jnp.int32))
-    place = jnp.where(last, ends[-1] + prefix_sum(last.astype(jnp.int32)), ends) - 1
-    place = jnp.where(exists, place, number.size)
-    return jnp.zeros_like(number).at[place].set(number, mode="drop"), ends[-1], total
+    return _Chosen(*_moved_last(number, total, parted.reshape(-1)), total)
+
+
+def _moved_last(number: Array, total: Array, last: Array) -> tuple[Array, Array]:
+    """Those numbers of which `last` is true behind the others, and how many are before these."""
+    at_once = min(number.size, PARTS_AT_ONCE)
+
+    def add(number: Array, exists: Array, found: _Lists) -> _Lists:
+        ahead, behind, before, after = found
+        one, count = compacted(exists & ~last[number], number)
+        other, rest = compacted(exists & last[number], number)
+        ahead = lax.dynamic_update_slice(ahead, one, (before,))
+        behind = lax.dynamic_update_slice(behind, other, (after,))
+        return ahead, behind, before + count, after + rest
+
+    zero = zero_after(total)
+    room = jnp.zeros(number.size + at_once, jnp.int32) + zero
+    ahead, behind, count, _ = over_batches(number, total, at_once, add, (room, room, zero, zero))
+    place = jnp.arange(number.size)
+    return jnp.where(place < count, ahead[place], behind[jnp.maximum(place - count, 0)]), count
 
 
 def _bends(color: Array) -> Array:
@@ -271,42 +285,42 @@ def _largest(values: Array, least: Array) -> tuple[Array, Array]:
     return numbers[:places], total
 
 
-def _parts_of_each(points: _Points) -> Array:
+def _parts_of_each(chosen: _Chosen) -> Array:
     """In how many parts those pixels are shaded that edges part: in four, if there is room."""
-    quarters = points.moving + 4 * (points.total - points.moving)
-    return jnp.where(quarters <= points.face.shape[1], 4, 1)
+    quarters = chosen.moving + 4 * (chosen.total - chosen.moving)
+    return jnp.where(quarters <= chosen.number.size, 4, 1)
 
 
-def _count(points: _Points) -> Array:
+def _count(chosen: _Chosen) -> Array:
     """Of all parts of pixels."""
-    return points.moving + _parts_of_each(points) * (points.total - points.moving)
+    return chosen.moving + _parts_of_each(chosen) * (chosen.total - chosen.moving)
 
 
-def _at_once(points: _Points) -> int:
-    places = points.number.size
+def _at_once(chosen: _Chosen) -> int:
+    places = chosen.number.size
     return min(places, PARTS_AT_ONCE) if draws_on_cpu() else places
 
 
-def _parts(points: _Points, n: Array, count: Array) -> _Parts:
+def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
     """The batch `n` of so many parts."""
-    size = _at_once(points)
+    size = _at_once(chosen)
     number = n * size + jnp.arange(size, dtype=jnp.int32)
-    after = number - points.moving
-    each = _parts_of_each(points)
+    after = number - chosen.moving
+    each = _parts_of_each(chosen)
     whole = (after < 0) | (each == 1)
-    place = jnp.where(whole, number, points.moving + after // 4)
-    place = jnp.minimum(place, points.number.size - 1)
+    place = jnp.where(whole, number, chosen.moving + after // 4)
+    place = jnp.minimum(place, chosen.number.size - 1)
     return _Parts(*stored((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
 
 
 def _over_parts(
-    points: _Points, count: Array, step: Callable[[Array, Any], Any], start: Any
+    chosen: _Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any
 ) -> Any:
-    return lax.fori_loop(0, batches_of(count, _at_once(points)), step, start)
+    return lax.fori_loop(0, batches_of(count, _at_once(chosen)), step, start)
 
 
 def _faces_at(
-    points: _Points,
+    chosen: _Chosen,
     face_image: Array,
     clip: Array,
     faces: Array,
@@ -318,7 +332,7 @@ def _faces_at(
     What the next pixels show may hide them.
     """
     height, width = face_image.shape
-    count = _count(points)
+    count = _count(chosen)
 
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
@@ -326,8 +340,8 @@ def _faces_at(
         neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
 
         def add(n: Array, found: Array) -> Array:
-            place, exists, part = _parts(points, n, count)
-            row, column = stored(jnp.divmod(points.number[place], width - 2))
+            place, exists, part = _parts(chosen, n, count)
+            row, column = stored(jnp.divmod(chosen.number[place], width - 2))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
             right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
             x, y = stored((column + 1.5 + right, row + 1.5 + down))
@@ -336,7 +350,7 @@ def _faces_at(
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             right, down = jnp.asarray(_ASIDE)[:, :, part]
             beside = face_image[row + 1 + down, column + 1 + right]
-            beside = jnp.where(exists & (place >= points.moving) & (beside != own), beside, -1)
+            beside = jnp.where(exists & (place >= chosen.moving) & (beside != own), beside, -1)
             starts = stored(jnp.concatenate([jnp.where(covered, -1, own), beside]))
             both = jnp.tile(x, (2, 1)), jnp.tile(y, (2, 1))
             ends, there = walk(starts, *both, faces, pixels, neighbors, volume)
@@ -349,10 +363,11 @@ def _faces_at(
             inner = stored(jnp.where(hidden, -1, inner))
             return lax.dynamic_update_slice_in_dim(found, inner, n * place.size, 1)
 
-        return _over_parts(points, count, add, found)
+        return _over_parts(chosen, count, add, found)
 
-    nothing = points.face + varying_zero((points, face_image, clip, faces, topology, apart))
-    return lax.cond(count > 0, find, lambda nothing: nothing, nothing)
+    nowhere = jnp.full((_POINTS.shape[1], chosen.number.size), -1, jnp.int32)
+    nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart))
+    return lax.cond(count > 0, find, lambda nowhere: nowhere, nowhere)
 
 
 def _together(topology: Topology, apart: Array) -> Array:
@@ -377,15 +392,15 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
     @jax.custom_jvp
     def added(inputs: _Inputs) -> Array:
         def all_batches(inputs: _Inputs) -> Array:
-            points = inputs.points
-            count = _count(points)
+            chosen = inputs.points.chosen
+            count = _count(chosen)
 
             def step(n: Array, total: Array) -> Array:
-                parts = _parts(points, n, count)
+                parts = _parts(chosen, n, count)
                 rows = stored(_of_parts(shade, size, inputs, parts, n))
                 return total.at[parts.place].add(rows)
 
-            return _over_parts(points, count, step, _nothing(inputs) + varying_zero(inputs))
+            return _over_parts(chosen, count, step, _nothing(inputs) + varying_zero(inputs))
 
         return over(all_batches)(varying_alike(inputs))
 
@@ -395,8 +410,8 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
         used = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
 
         def of_used(leaves: list[Array], n: Array) -> tuple[Array, Callable[..., Array]]:
-            points = jax.tree.unflatten(tree, leaves).points
-            parts = _parts(points, n, points.moving)
+            chosen = jax.tree.unflatten(tree, leaves).points.chosen
+            parts = _parts(chosen, n, chosen.moving)
 
             def of(*values: Array) -> Array:
                 given = dict(zip(used, values, strict=True))
@@ -406,8 +421,8 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
             return parts.place, of
 
         def over_moving(leaves: list[Array], step: Callable[[Array, Any], Any], start: Any) -> Any:
-            points = jax.tree.unflatten(tree, leaves).points
-            return _over_parts(points, points.moving, step, start)
+            chosen = jax.tree.unflatten(tree, leaves).points.chosen
+            return _over_parts(chosen, chosen.moving, step, start)
 
         def push(leaves: list[Array], changes: list[Array], nothing: Array) -> Array:
             at = [leaves[i] for i in used]
@@ -441,7 +456,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
 
 
 def _nothing(inputs: _Inputs) -> Array:
-    return jnp.zeros((inputs.points.number.size, 3), inputs.drawn.positions_clip.dtype)
+    return jnp.zeros((inputs.points.chosen.number.size, 3), inputs.drawn.positions_clip.dtype)
 
 
 def _of_parts(
@@ -449,7 +464,7 @@ def _of_parts(
 ) -> Float[Array, "some 3"]:
     """What `_added` finds for parts of the batch `n`: of what is not seen, edges tell."""
     data, drawn, points = inputs
-    row, column = jnp.divmod(points.number[parts.place], size[1])
+    row, column = jnp.divmod(points.chosen.number[parts.place], size[1])
     some = row.size
     face = lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
     full = size[0] + 2, size[1] + 2

@@ -66,7 +66,7 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
 
     def watched(shade, size, inputs):
         found.append((shade, size, inputs))
-        return jnp.zeros((inputs.points.number.size, 3))
+        return jnp.zeros((inputs.points.chosen.number.size, 3))
 
     added = turning._added
     with monkeypatch.context() as patch:
@@ -75,8 +75,8 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         patch.setattr(turning, "_FEW", 32)
         dr.render.__wrapped__(scene(), camera(), settings(40))
         ((shade, size, inputs),) = found
-        points = inputs.points
-        assert 32 < points.moving < points.total <= points.number.size
+        chosen = inputs.points.chosen
+        assert 32 < chosen.moving < chosen.total <= chosen.number.size
 
         def colors(vertices, direction, at_once):
             patch.setattr(turning, "PARTS_AT_ONCE", at_once)
@@ -93,12 +93,12 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         rng = np.random.default_rng(0)
         at = inputs.drawn.attributes[0], jnp.array([-1.0, -1, -2])
         way = tuple(jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in at)
-        places = points.number.size
-        used = (jnp.arange(places) < points.moving)[:, None]  # the others have no derivative
+        places = chosen.number.size
+        used = (jnp.arange(places) < chosen.moving)[:, None]  # the others have no derivative
 
         def in_one_go(*values):
             whole, first = colors(*values, places), jnp.zeros((), jnp.int32)
-            parts = turning._parts(points, first, points.moving)
+            parts = turning._parts(chosen, first, chosen.moving)
             return turning._of_parts(shade, size, whole, parts, first)
 
         def in_batches(*values):
