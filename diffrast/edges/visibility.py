@@ -330,10 +330,12 @@ def look(
         volume,
     )
 
-    # Which side is what the pixel shows at its centre.
-    is_front = (front_shown == 4) & (patch[4] == front_patch) & (pictured[4] >= 0)
-    alike = (beyond == -1) | (patch[4] == topology.patches[jnp.maximum(beyond, 0)])
-    is_beyond = (beyond_look == 4) & (pictured[4] >= 0) & (beyond != BACKGROUND) & alike
+    # Which side is what the pixel shows at its centre: one surface may lie there in several layers.
+    shows = pictured[4] >= 0
+    is_front = shows & (front_shown == 4) & (patch[4] == front_patch)
+    is_front = is_front & (~fold | ((front_look == 4) & connected[0]))
+    alike = (beyond == -1) | (beyond == pictured[4])
+    is_beyond = shows & (beyond_look == 4) & alike
 
     # A flap of a curved surface, narrower than a pixel, in front of that surface itself.
     same = picked(patch, beyond_look) == front_patch
