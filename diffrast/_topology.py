@@ -91,6 +91,11 @@ def representatives(positions: Any, xp: Any = np) -> Any:
     return first[xp.argsort(order)].astype(np.int32)
 
 
+def third_corner(edge: Any) -> Any:
+    """The corner of faces that is not on their edges, which are given as in `Edges.corners`."""
+    return 3 - edge // 3 - edge % 3
+
+
 def half_edges(positions: np.ndarray, faces: np.ndarray) -> HalfEdges:
     """Directed edges over vertices welded by exact position.
 
@@ -149,7 +154,7 @@ def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
     neighbors = np.full(faces.shape, -1, np.int32)
     for side in range(2):
         paired = beyond >= 0
-        sides = 3 - packed[paired, side] // 3 - packed[paired, side] % 3
+        sides = third_corner(packed[paired, side])
         neighbors[adjacency.edge_faces[paired, side], sides] = adjacency.edge_faces[
             paired, 1 - side
         ]
@@ -209,7 +214,7 @@ def traced_topology(positions: Array, faces: Array) -> Topology:
     )
     neighbors = jnp.full((count, 3), -1, jnp.int32)
     for side in range(2):
-        sides = 3 - edges.corners[:, side] // 3 - edges.corners[:, side] % 3
+        sides = third_corner(edges.corners[:, side])
         own = jnp.where(paired, edges.faces[:, side], count)
         neighbors = neighbors.at[own, sides].set(edges.faces[:, 1 - side], mode="drop")
     patches, bodies = (_traced_joined(f, positions.shape[0]) for f in (faces, welded))

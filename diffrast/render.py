@@ -157,7 +157,7 @@ def render(
             with jax.named_scope("turning"):
                 unshadowed = world._replace(shadows=None)
                 image = with_turns(
-                    shader, unshadowed, drawn, face, reached, topology, apart, turning, hard, image
+                    shader, unshadowed, drawn, reached, topology, apart, turning, image
                 )
         if side == 1:
             return image

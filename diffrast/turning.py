@@ -21,7 +21,7 @@ from diffrast._device import draws_on_cpu, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of, compacted, over_batches
 from diffrast._stored import stored, zero_after
-from diffrast._topology import Topology
+from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.edges.neighborhood import walk
 from diffrast.edges.pieces import facing, to_pixels
@@ -31,11 +31,12 @@ from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, pixels_at
 from diffrast.shadows import Reached
 
-_Lists: TypeAlias = tuple[Array, Array, Array, Array]
+_Lists: TypeAlias = tuple[Array, Array, Array, Array]  # two, and the lengths of both
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
 PARTS_AT_ONCE = 1024
 _FEW = 128  # of them in small images
+_POINTS_AT_ONCE = 512
 _SHARE = 10  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
 _PLAIN = 0.005  # of the same: what edges may add where they part nothing
@@ -63,18 +64,40 @@ _ASIDE = np.where([~_STEEP, _STEEP], np.sign(_POINTS), 0).astype(np.int32)  # th
 
 
 class Turning(NamedTuple):
-    """What the picture without edges tells of where colours turn."""
+    """The picture without edges, with a border of one pixel, and where its colours turn."""
 
+    face_image: Int[Array, "height_with_border width_with_border"]  # what is seen, -1 for nothing
+    hard: Float[Array, "height_with_border width_with_border 3"]  # its colours
+    mean: Float[Array, ""]  # of the whole
     chosen: Bool[Array, "height width"]  # pixels that get their surface's mean colour in any case
-    mean: Float[Array, ""]  # colour of the whole picture
 
 
 class _Chosen(NamedTuple):
-    """The pixels that are shaded at more points."""
+    """The pixels that are shaded at more points, those that edges part last.
+
+    These have no derivative here, and are shaded in four quarters if there is room.
+    """
 
     number: Int[Array, " places"]
-    moving: Int[Array, ""]  # the first ones, which have a derivative and are shaded as a whole,
+    plain: Int[Array, ""]  # so many that edges do not part,
     total: Int[Array, ""]  # and all
+
+    @property
+    def at_once(self) -> int:
+        """How many parts of pixels are shaded side by side."""
+        places = self.number.size
+        return min(places, PARTS_AT_ONCE) if draws_on_cpu() else places
+
+    @property
+    def parts_of_each(self) -> Int[Array, ""]:
+        """In how many parts those pixels are shaded that edges part."""
+        parts = self.plain + 4 * (self.total - self.plain)
+        return jnp.where(parts <= self.number.size, 4, 1)
+
+    @property
+    def parts(self) -> Int[Array, ""]:
+        """How many there are of all pixels."""
+        return self.plain + self.parts_of_each * (self.total - self.plain)
 
 
 class _Points(NamedTuple):
@@ -107,7 +130,7 @@ def find_turning(
 ) -> Turning:
     """Where colours bend most in an image without edges: at no more than one of 20 pixels."""
 
-    def find(face_image: Array, hard: Array) -> Turning:
+    def find(face_image: Array, hard: Array) -> tuple[Array, Array]:
         color = _sums(hard)
         some = slice(_ROWS // 2, None, _ROWS)
         seen = face_image[some] >= 0
@@ -117,24 +140,20 @@ def find_turning(
         def are_many(least: Array) -> Array:
             return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
 
-        least = lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
-        return Turning(bends > least, mean)
+        return mean, bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
 
     seen = lax.stop_gradient((face_image, hard))
-    found: Turning = over_views(lambda _: find, face_image.size)(*seen)
-    return found
+    return Turning(*seen, *over_views(lambda _: find, face_image.size)(*seen))
 
 
 def with_turns(
     shade: Shade,
     data: Any,
     drawn: Drawn,
-    face_image: Int[Array, "height_with_border width_with_border"],
     reached: Reached,
     topology: Topology,
     apart: Bool[Array, " edges"],
     turning: Turning,
-    hard: Float[Array, "height_with_border width_with_border 3"],
     image: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 3"]:
     """An image with the mean colours of pixels in which colours turn.
@@ -146,20 +165,16 @@ def with_turns(
         shade: colours of points, one array a channel; its first argument is `data`.
         data: a tree of all arrays that it uses.
         drawn: what is drawn, in an image with a border of one pixel all round.
-        face_image: the face that each of these pixels sees, -1 for none.
         reached: by each light; images of that size.
         topology: of the faces.
         apart: whether colours may jump across an edge.
         turning: what `find_turning` found; the edges know of the pixels chosen there.
-        hard: that image, without edges.
-        image: the one with edges, without its border.
+        image: with edges and without the border.
     """
     height, width = image.shape[:2]
 
     def find(
         turning: Turning,
-        face_image: Array,
-        hard: Array,
         image: Array,
         reached: Reached,
         clip: Array,
@@ -167,14 +182,15 @@ def with_turns(
         topology: Topology,
         apart: Array,
     ) -> _Points:
-        chosen = _bending(turning, face_image, hard, image)
+        chosen = _bending(turning, image)
         row, column = jnp.divmod(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        return _Points(chosen, _faces_at(chosen, face_image, clip, faces, topology, apart), lit)
+        face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart)
+        return _Points(chosen, face, lit)
 
-    seen = lax.stop_gradient((turning, face_image, hard, image, reached, drawn.positions_clip))
-    surface = jax.tree.map(jnp.asarray, topology), apart
-    points = over_views(lambda _: find, height * width)(*seen, drawn.faces, *surface)
+    seen = lax.stop_gradient((turning, image, reached, drawn.positions_clip))
+    surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart
+    points = over_views(lambda _: find, height * width)(*seen, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     number, _, total = points.chosen
     place = jnp.arange(number.size)
@@ -199,34 +215,15 @@ def _places(image: Array) -> int:
     return -(-most // unit) * unit
 
 
-def _bending(turning: Turning, face_image: Array, hard: Array, image: Array) -> _Chosen:
+def _bending(turning: Turning, image: Array) -> _Chosen:
     """Those where colours bend most."""
+    face_image, hard, mean, chosen = turning
     changes = stored(_sums(jnp.abs(image - hard[1:-1, 1:-1])))
-    parted = stored(changes > _PLAIN * turning.mean)
+    parted = stored(changes > _PLAIN * mean)
     # What the background shows, or an edge changes, is not a number.
     color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
-    bends = stored(jnp.where(turning.chosen, jnp.inf, _bends(color)))
-    number, total = _largest(bends, _least(turning.mean))
-    return _Chosen(*_moved_last(number, total, parted.reshape(-1)), total)
-
-
-def _moved_last(number: Array, total: Array, last: Array) -> tuple[Array, Array]:
-    """Those numbers of which `last` is true behind the others, and how many are before these."""
-    at_once = min(number.size, PARTS_AT_ONCE)
-
-    def add(number: Array, exists: Array, found: _Lists) -> _Lists:
-        ahead, behind, before, after = found
-        one, count = compacted(exists & ~last[number], number)
-        other, rest = compacted(exists & last[number], number)
-        ahead = lax.dynamic_update_slice(ahead, one, (before,))
-        behind = lax.dynamic_update_slice(behind, other, (after,))
-        return ahead, behind, before + count, after + rest
-
-    zero = zero_after(total)
-    room = jnp.zeros(number.size + at_once, jnp.int32) + zero
-    ahead, behind, count, _ = over_batches(number, total, at_once, add, (room, room, zero, zero))
-    place = jnp.arange(number.size)
-    return jnp.where(place < count, ahead[place], behind[jnp.maximum(place - count, 0)]), count
+    bends = stored(jnp.where(chosen, jnp.inf, _bends(color)))
+    return _largest(bends, _least(mean), parted)
 
 
 def _bends(color: Array) -> Array:
@@ -247,10 +244,10 @@ def _bend(one: Array, middle: Array, other: Array) -> Array:
     return jnp.abs(jnp.where(both == both, both, alone))
 
 
-def _largest(values: Array, least: Array) -> tuple[Array, Array]:
-    """Numbers of the pixels with more than the least value, and how many they are.
+def _largest(values: Array, least: Array, last: Array) -> _Chosen:
+    """The pixels with more than the least value, those of which `last` is true behind the others.
 
-    If these are too many, of those with more than twice, four times, ... as much. Blocks of pixels
+    If these are too many, those with more than twice, four times, ... as much. Blocks of pixels
     one below the other are looked through: their largest values are quick to find.
     """
     height, width = values.shape
@@ -258,57 +255,47 @@ def _largest(values: Array, least: Array) -> tuple[Array, Array]:
     blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
     blocks = jnp.max(blocks, axis=1).reshape(-1)
 
-    def are_few(found: tuple[Array, Array]) -> Array:
-        return found[1] <= places
+    def are_few(found: _Lists) -> Array:
+        return found[2] + found[3] <= places
 
-    def look(state: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
-        least, (numbers, _) = state
+    def look(state: tuple[Array, _Lists]) -> tuple[Array, _Lists]:
+        least, (ahead, behind, _, _) = state
         order, size = compacted(blocks > least, jnp.arange(blocks.size, dtype=jnp.int32))
 
-        def add(block: Array, exists: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            numbers, total = found
+        def add(block: Array, exists: Array, found: _Lists) -> _Lists:
+            ahead, behind, before, after = found
             first = block // width * _BLOCK * width + block % width
             number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
             value = values.reshape(-1).at[number].get(mode="fill", fill_value=0)
-            chosen = exists & (value > least)
-            more, count = compacted(chosen.reshape(-1), number.reshape(-1))
-            return lax.dynamic_update_slice(numbers, more, (total,)), total + count
+            chosen = stored(exists & (value > least)).reshape(-1)
+            is_last = last.reshape(-1).at[number].get(mode="clip").reshape(-1)
+            one, more = compacted(chosen & ~is_last, number.reshape(-1))
+            other, rest = compacted(chosen & is_last, number.reshape(-1))
+            ahead = lax.dynamic_update_slice(ahead, one, (before,))
+            behind = lax.dynamic_update_slice(behind, other, (after,))
+            return ahead, behind, before + more, after + rest
 
-        start = jnp.zeros_like(numbers), zero_after(size)
-        found = over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
-        return 2 * least, found
+        zero = zero_after(size)
+        start = jnp.zeros_like(ahead), jnp.zeros_like(behind), zero, zero
+        return 2 * least, over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
 
     zero = zero_after(blocks[0]).astype(jnp.int32)
     room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
-    start = least, (room, zero + places + 1)
-    _, (numbers, total) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    return numbers[:places], total
-
-
-def _parts_of_each(chosen: _Chosen) -> Array:
-    """In how many parts those pixels are shaded that edges part: in four, if there is room."""
-    quarters = chosen.moving + 4 * (chosen.total - chosen.moving)
-    return jnp.where(quarters <= chosen.number.size, 4, 1)
-
-
-def _count(chosen: _Chosen) -> Array:
-    """Of all parts of pixels."""
-    return chosen.moving + _parts_of_each(chosen) * (chosen.total - chosen.moving)
-
-
-def _at_once(chosen: _Chosen) -> int:
-    places = chosen.number.size
-    return min(places, PARTS_AT_ONCE) if draws_on_cpu() else places
+    start = least, (room, room, zero + places + 1, zero)
+    _, found = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
+    ahead, behind, before, after = found
+    place = jnp.arange(places)
+    number = jnp.where(place < before, ahead[place], behind[jnp.maximum(place - before, 0)])
+    return _Chosen(number, before, before + after)
 
 
 def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
     """The batch `n` of so many parts."""
-    size = _at_once(chosen)
+    size = chosen.at_once
     number = n * size + jnp.arange(size, dtype=jnp.int32)
-    after = number - chosen.moving
-    each = _parts_of_each(chosen)
-    whole = (after < 0) | (each == 1)
-    place = jnp.where(whole, number, chosen.moving + after // 4)
+    after = number - chosen.plain
+    whole = (after < 0) | (chosen.parts_of_each == 1)
+    place = jnp.where(whole, number, chosen.plain + after // 4)
     place = jnp.minimum(place, chosen.number.size - 1)
     return _Parts(*stored((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
 
@@ -316,7 +303,7 @@ def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
 def _over_parts(
     chosen: _Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any
 ) -> Any:
-    return lax.fori_loop(0, batches_of(count, _at_once(chosen)), step, start)
+    return lax.fori_loop(0, batches_of(count, chosen.at_once), step, start)
 
 
 def _faces_at(
@@ -332,36 +319,30 @@ def _faces_at(
     What the next pixels show may hide them.
     """
     height, width = face_image.shape
-    count = _count(chosen)
+    count = chosen.parts
 
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
-        volume = facing(pixels, faces)
         neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
+        surface = faces, pixels, neighbors, facing(pixels, faces)
 
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(chosen, n, count)
             row, column = stored(jnp.divmod(chosen.number[place], width - 2))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
             right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
-            x, y = stored((column + 1.5 + right, row + 1.5 + down))
-            own = jnp.broadcast_to(centre, x.shape)
+            point = x, y = stored((column + 1.5 + right, row + 1.5 + down))
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
-            right, down = jnp.asarray(_ASIDE)[:, :, part]
-            beside = face_image[row + 1 + down, column + 1 + right]
-            beside = jnp.where(exists & (place >= chosen.moving) & (beside != own), beside, -1)
-            starts = stored(jnp.concatenate([jnp.where(covered, -1, own), beside]))
-            both = jnp.tile(x, (2, 1)), jnp.tile(y, (2, 1))
-            ends, there = walk(starts, *both, faces, pixels, neighbors, volume)
-            inner, outer = stored(jnp.where(there, ends, -1)).reshape(2, *x.shape)
-            inner = jnp.where(covered, own, inner)
-            near, far = (
-                edge_values(corners_of(end, faces, pixels), x, y)[1] for end in (outer, inner)
-            )
-            hidden = (outer >= 0) & (near > far * (1 + FINE_TOLERANCE))
-            inner = stored(jnp.where(hidden, -1, inner))
-            return lax.dynamic_update_slice_in_dim(found, inner, n * place.size, 1)
+            own = jnp.broadcast_to(centre, x.shape)
+            ends, there = walk(stored(jnp.where(covered, -1, own)), x, y, *surface)
+            seen = stored(jnp.where(covered, own, jnp.where(there, ends, -1)))
+            right, down = stored(jnp.asarray(_ASIDE)[:, :, part])
+            beside = stored(face_image[row + 1 + down, column + 1 + right])
+            parted = exists & (place >= chosen.plain)
+            beside = stored(jnp.where(parted & (beside != own), beside, -1))
+            seen = _unhidden(seen, beside, point, (column + 1.5 + right, row + 1.5 + down), surface)
+            return lax.dynamic_update_slice_in_dim(found, seen, n * place.size, 1)
 
         return _over_parts(chosen, count, add, found)
 
@@ -370,14 +351,50 @@ def _faces_at(
     return lax.cond(count > 0, find, lambda nowhere: nowhere, nowhere)
 
 
+def _unhidden(
+    seen: Int[Array, "points parts"],
+    beside: Int[Array, "points parts"],
+    point: tuple[Array, Array],
+    centre: tuple[Array, Array],
+    surface: tuple[Array, Array, Array, Array],
+) -> Int[Array, "points parts"]:
+    """What is seen at points, -1 where the surface that the next pixel shows lies before that.
+
+    It does not if at that pixel's centre it lies behind the plane of what is seen at the point.
+    """
+    faces, pixels, _, _ = surface
+    order, count = compacted(
+        ((seen >= 0) & (beside >= 0) & (beside != seen)).reshape(-1),
+        jnp.arange(seen.size, dtype=jnp.int32),
+    )
+    known = stored([part.reshape(-1) for part in (beside, *point, *centre)])
+
+    def hide(number: Array, exists: Array, seen: Array) -> Array:
+        face, other, x, y, centre_x, centre_y = stored([part[number] for part in (seen, *known)])
+        corners = corners_of(face, faces, pixels)
+
+        def is_before(other: Array, x: Array, y: Array, tolerance: float = 0) -> Array:
+            both = corners_of(other, faces, pixels), corners
+            near, far = (edge_values(of_one, x, y)[1] for of_one in both)
+            return near > far * (1 + tolerance)
+
+        may_hide = exists & is_before(other, centre_x, centre_y)
+        start = stored(jnp.where(may_hide, other, -1))
+        end, there = walk(start, x, y, *surface)
+        hidden = there & (end >= 0) & is_before(end, x, y, FINE_TOLERANCE)
+        return seen.at[jnp.where(hidden, number, seen.size)].set(-1, mode="drop")
+
+    at_once = _POINTS_AT_ONCE if draws_on_cpu() else seen.size
+    return over_batches(order, count, at_once, hide, seen.reshape(-1)).reshape(seen.shape)
+
+
 def _together(topology: Topology, apart: Array) -> Array:
     return topology.neighbors + varying_zero((topology, apart))
 
 
 def _parted(topology: Topology, apart: Array) -> Array:
     """The neighbours of faces, but none across these edges."""
-    corners, count = topology.edges.corners, topology.neighbors.shape[0]
-    side = 3 - corners // 3 - corners % 3
+    side, count = third_corner(topology.edges.corners), topology.neighbors.shape[0]
     face = jnp.where(apart[:, None], topology.edges.faces, -1)
     face = jnp.where(face >= 0, face, count)
     return _together(topology, apart).at[face, side].set(-1, mode="drop")
@@ -393,7 +410,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
     def added(inputs: _Inputs) -> Array:
         def all_batches(inputs: _Inputs) -> Array:
             chosen = inputs.points.chosen
-            count = _count(chosen)
+            count = chosen.parts
 
             def step(n: Array, total: Array) -> Array:
                 parts = _parts(chosen, n, count)
@@ -411,7 +428,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
 
         def of_used(leaves: list[Array], n: Array) -> tuple[Array, Callable[..., Array]]:
             chosen = jax.tree.unflatten(tree, leaves).points.chosen
-            parts = _parts(chosen, n, chosen.moving)
+            parts = _parts(chosen, n, chosen.plain)
 
             def of(*values: Array) -> Array:
                 given = dict(zip(used, values, strict=True))
@@ -420,9 +437,9 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
 
             return parts.place, of
 
-        def over_moving(leaves: list[Array], step: Callable[[Array, Any], Any], start: Any) -> Any:
+        def over_plain(leaves: list[Array], step: Callable[[Array, Any], Any], start: Any) -> Any:
             chosen = jax.tree.unflatten(tree, leaves).points.chosen
-            return _over_parts(chosen, chosen.moving, step, start)
+            return _over_parts(chosen, chosen.plain, step, start)
 
         def push(leaves: list[Array], changes: list[Array], nothing: Array) -> Array:
             at = [leaves[i] for i in used]
@@ -431,7 +448,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
                 place, of = of_used(leaves, n)
                 return total.at[place].add(jax.jvp(of, at, changes)[1])
 
-            return over_moving(leaves, step, nothing)
+            return over_plain(leaves, step, nothing)
 
         def pull(leaves: list[Array], cotangent: Array) -> list[Array]:
             at = [leaves[i] for i in used]
@@ -441,7 +458,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
                 back = jax.vjp(of, *at)[1]
                 return jax.tree.map(jnp.add, total, list(back(cotangent[place])))
 
-            return over_moving(leaves, step, [linear_zeros(leaf.shape, cotangent) for leaf in at])
+            return over_plain(leaves, step, [linear_zeros(leaf.shape, cotangent) for leaf in at])
 
         change = linear_map(
             lambda changes, nothing: over(push)(leaves, changes, nothing),

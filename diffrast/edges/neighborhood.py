@@ -83,14 +83,14 @@ def turned_alike(face: Int[Array, "*n"], facing: Array, volume: Float[Array, " F
 
 
 def walk(
-    face: Int[Array, "ways n"],
-    x: Float[Array, "ways n"],
-    y: Float[Array, "ways n"],
+    face: Int[Array, "*ways"],
+    x: Float[Array, "*ways"],
+    y: Float[Array, "*ways"],
     faces: Int[Array, "F 3"],
     pixels: Table,
     neighbors: Int[Array, "F 3"],
     volume: Float[Array, " F"],
-) -> tuple[Int[Array, "ways n"], Bool[Array, "ways n"]]:
+) -> tuple[Int[Array, "*ways"], Bool[Array, "*ways"]]:
     """The faces that cover points, found from other faces on ways towards these.
 
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or

@@ -16,7 +16,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
-from diffrast._topology import Topology
+from diffrast._topology import Topology, third_corner
 from diffrast.edges.neighborhood import (
     first_row,
     is_bare_near,
@@ -397,8 +397,7 @@ def _thickness(
     t: Array,
 ) -> Array:
     """How far a face reaches from the point `t` of its edge, at right angles to it, or less."""
-    third = 3 - edge // 3 - edge % 3
-    x, y, w = pixels[:, stored(faces[jnp.maximum(face, 0), third])]
+    x, y, w = pixels[:, stored(faces[jnp.maximum(face, 0), third_corner(edge)])]
     inverse_w = 1 / jnp.where(w > 0, w, 1)
     x, y = x * inverse_w - start[0], y * inverse_w - start[1]
     height = jnp.abs(x * normal[0] + y * normal[1])
