@@ -36,7 +36,7 @@ Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
 PARTS_AT_ONCE = 1024
 _FEW = 128  # of them in small images
-_POINTS_AT_ONCE = 512
+_POINTS_AT_ONCE = 512  # that may be hidden
 _SHARE = 10  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
 _PLAIN = 0.005  # of the same: what edges may add where they part nothing
