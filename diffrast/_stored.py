@@ -6,15 +6,25 @@ for every channel. `lax.optimization_barrier` does not stop the CPU compiler, wh
 before it fuses. What it never computes twice is a division: so a value is divided by a one that it
 cannot know to be one until it has fused, to the same bits, and so is its derivative in either
 direction. Once fused, the division is found out and costs nothing.
+
+Of small arrays there are hundreds, and compiling takes a CPU some 20 ms for each pass over them.
+The only pass that writes several arrays is a reduction of several: so those of one shape are the
+maximum of themselves and of a padding that is the least there is. Of that nothing is left, either,
+but one loop, vectorised, in which what they have in common is computed once.
 """
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.custom_derivatives import SymbolicZero
+
+from diffrast._device import draws_on_cpu
 
 T = TypeVar("T")
+
+_SMALL = 4096  # numbers of an array; larger ones are better written side by side, by several cores
 
 
 def stored(values: T, witness: Array | None = None) -> T:
@@ -25,15 +35,28 @@ def stored(values: T, witness: Array | None = None) -> T:
     """
 
     def store(value: Array) -> Array:
-        if value.dtype == bool:
-            return value
         if witness is not None:
-            return lax.div(value, _one(witness, value.dtype))
-        return (
-            _stored_number(value) if jnp.issubdtype(value.dtype, jnp.inexact) else _divided(value)
-        )
+            return _divided(value, witness)
+        moves = jnp.issubdtype(value.dtype, jnp.inexact)
+        return _stored(value)[0] if moves else _divided(value, value)
 
     return jax.tree.map(store, values)
+
+
+def stored_together(values: T) -> T:
+    """The same, with one pass for small arrays of one shape on a CPU.
+
+    Under `vmap` their last bits may be others: it is meant for what takes one view after another.
+    """
+    leaves, tree = jax.tree.flatten(values)
+    groups: dict[Any, list[int]] = {}
+    for i, leaf in enumerate(leaves):
+        alone = leaf.size > _SMALL or not draws_on_cpu()
+        groups.setdefault((i, "alone") if alone else leaf.shape, []).append(i)
+    for group in groups.values():
+        for i, value in zip(group, _stored(*(leaves[i] for i in group)), strict=True):
+            leaves[i] = value
+    return jax.tree.unflatten(tree, leaves)
 
 
 def _one(witness: Array, dtype: jnp.dtype) -> Array:
@@ -44,20 +67,41 @@ def _one(witness: Array, dtype: jnp.dtype) -> Array:
     return lax.select(same < same, lax.full_like(same, 2, dtype), lax.full_like(same, 1, dtype))
 
 
-def _divided(value: Array) -> Array:
-    return lax.div(value, _one(value, value.dtype))
+def _divided(value: Array, witness: Array) -> Array:
+    return value if value.dtype == bool else lax.div(value, _one(witness, value.dtype))
+
+
+def _least(dtype: Any) -> Array:
+    if jnp.issubdtype(dtype, jnp.bool_):
+        return jnp.zeros((), dtype)
+    least = -jnp.inf if jnp.issubdtype(dtype, jnp.inexact) else jnp.iinfo(dtype).min
+    return jnp.asarray(least, dtype)
 
 
 @jax.custom_jvp
-def _stored_number(value: Array) -> Array:
-    return _divided(value)
+def _stored(*values: Array) -> tuple[Array, ...]:
+    """One array, or several of one shape in one pass."""
+    if len(values) == 1:
+        return (_divided(values[0], values[0]),)
+    least = [_least(value.dtype) for value in values]
+    rows = [
+        lax.pad(value[None], low, [(0, 1, 0), *[(0, 0, 0)] * value.ndim])
+        for value, low in zip(values, least, strict=True)
+    ]
+    return tuple(lax.reduce(rows, least, lambda a, b: list(map(lax.max, a, b)), (0,)))
 
 
-@_stored_number.defjvp
-def _stored_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+def _stored_derivative(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     """The one is made of what is stored: of the value itself all of it would be computed again."""
-    found = _stored_number(*primals)
-    return found, lax.div(tangents[0], _one(found, found.dtype))
+    found = _stored(*primals)
+    changes = zip(tangents, found, strict=True)
+    return found, tuple(
+        change if isinstance(change, SymbolicZero) else _divided(change, value)
+        for change, value in changes
+    )
+
+
+_stored.defjvp(_stored_derivative, symbolic_zeros=True)
 
 
 def zero_after(witness: Array) -> Array:
@@ -102,10 +146,10 @@ def interleaved(channels: list[Array]) -> Array:
     return stored_alone(jnp.stack(channels, axis=-1))
 
 
-def assemble(channels: list[Array], *, first: bool = False) -> Array:
-    """Stack channels along a new last axis, or a new first one, each computed once."""
+def assemble(channels: list[Array]) -> Array:
+    """Stack channels along a new last axis, each computed once."""
     shape, count = channels[0].shape, len(channels)
-    image = jnp.zeros((count, *shape) if first else (*shape, count), channels[0].dtype)
+    image = jnp.zeros((*shape, count), channels[0].dtype)
     for c, channel in enumerate(channels):
-        image = image.at[c if first else (..., c)].set(channel)
+        image = image.at[..., c].set(channel)
     return image

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._device import draws_on_cpu, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of, compacted, over_batches
-from diffrast._stored import stored, zero_after
+from diffrast._stored import stored, stored_together, zero_after
 from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.edges.neighborhood import walk
@@ -297,7 +297,7 @@ def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
     whole = (after < 0) | (chosen.parts_of_each == 1)
     place = jnp.where(whole, number, chosen.plain + after // 4)
     place = jnp.minimum(place, chosen.number.size - 1)
-    return _Parts(*stored((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
+    return _Parts(*stored_together((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
 
 
 def _over_parts(
@@ -331,7 +331,7 @@ def _faces_at(
             row, column = stored(jnp.divmod(chosen.number[place], width - 2))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
             right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
-            point = x, y = stored((column + 1.5 + right, row + 1.5 + down))
+            point = x, y = stored_together((column + 1.5 + right, row + 1.5 + down))
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             own = jnp.broadcast_to(centre, x.shape)
@@ -367,10 +367,12 @@ def _unhidden(
         ((seen >= 0) & (beside >= 0) & (beside != seen)).reshape(-1),
         jnp.arange(seen.size, dtype=jnp.int32),
     )
-    known = stored([part.reshape(-1) for part in (beside, *point, *centre)])
+    known = stored_together([part.reshape(-1) for part in (beside, *point, *centre)])
 
     def hide(number: Array, exists: Array, seen: Array) -> Array:
-        face, other, x, y, centre_x, centre_y = stored([part[number] for part in (seen, *known)])
+        face, other, x, y, centre_x, centre_y = stored_together(
+            [part[number] for part in (seen, *known)]
+        )
         corners = corners_of(face, faces, pixels)
 
         def is_before(other: Array, x: Array, y: Array, tolerance: float = 0) -> Array:
@@ -488,7 +490,7 @@ def _of_parts(
     pixels = pixels_at(face, row + 1, column + 1, full, drawn.positions_clip.dtype)
     right, down = jnp.asarray(_POINTS)[:, :, parts.points]
     x, y = pixels.x + 2 * right, pixels.y - 2 * down
-    flat, x, y = stored([part.reshape(-1) for part in (face, x, y)])
+    flat, x, y = stored_together([part.reshape(-1) for part in (face, x, y)])
     lit = jax.tree.map(lambda part: jnp.tile(part[parts.place], face.shape[0]), points.reached)
     seen = points_at(drawn, pixels._replace(face=flat, x=x, y=y))
     colors = [color.reshape(face.shape) for color in shade(data, seen, lit)]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-MODULES = ["tests/test_edges.py", "tests/test_render.py", "tests/test_views.py"]
+MODULES = ["tests/test_edges.py", "tests/test_stored.py", "tests/test_views.py"]
 
 
 def test_those_that_ask_for_it():

@@ -16,7 +16,6 @@ from scipy.linalg import expm
 
 import diffrast as dr
 from diffrast import linalg, shapes
-from diffrast._stored import assemble, stored, stored_rows
 from diffrast.camera import pixel_rays, viewpoint
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -414,30 +413,6 @@ def test_a_gradient_in_lights_only_has_no_part_for_the_geometry():
     to_vertices = [c["scatter", f"{VERTICES}xf32"] for c in counts]
     assert to_vertices[0] == 0
     assert to_vertices[1] > 0
-
-
-@pytest.mark.default_compilation
-def test_stored_values_and_their_derivatives_are_unchanged():
-    values = jnp.array(np.random.default_rng(0).normal(size=(50, 3)))
-    special = jnp.array([0.0, -0.0, jnp.inf, -jnp.inf, jnp.nan, 1e-45, -3e38])
-    for given in (special, values, jnp.array([-(2**31), 0, 2**31 - 1]), values > 0):
-        np.testing.assert_array_equal(jax.jit(stored)(given), given)
-    for same in (stored_rows(values), assemble(list(values.T))):
-        np.testing.assert_array_equal(same, values)
-    _, tangent = jax.jvp(stored_rows, (values,), (values + 1,))
-    np.testing.assert_array_equal(tangent, values + 1)
-
-
-def test_stored_values_are_computed_once():
-    def twice(values, keep):
-        large = keep(jnp.exp2(values) * values + 1)
-        return jnp.sin(large), jnp.cos(large)
-
-    def count(keep):
-        text = jax.jit(lambda x: twice(x, keep)).lower(jnp.ones(999)).compile().as_text()
-        return text.count(" add(")
-
-    assert count(stored) == 1 <= count(lambda x: x)
 
 
 def test_other_values_are_not_compiled_again():

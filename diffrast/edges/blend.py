@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import assemble, stored
-from diffrast._topology import Topology
+from diffrast._stored import stored, stored_together
+from diffrast._topology import Topology, by_three
 from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
@@ -141,7 +141,8 @@ def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Ble
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
     """Index in the image with its border of one of the 3×3 pixels round pixels."""
-    return (pixel[1] + look // 3) * view.image.shape[1] + pixel[0] + look % 3
+    row, column = by_three(look)
+    return (pixel[1] + row) * view.image.shape[1] + pixel[0] + column
 
 
 def _number(view: View, pixel: Array) -> Array:
@@ -168,8 +169,8 @@ def _shade(
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
         barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
-    colors = assemble(method.shader(view.scene, face, barycentrics, told), first=True)
-    return jnp.split(colors, len(points), axis=1)
+    colors = stored_together(method.shader(view.scene, face, barycentrics, told))
+    return jnp.split(jnp.stack(colors), len(points), axis=1)
 
 
 def _told(
@@ -203,7 +204,7 @@ def with_pieces(
     rim = found.rim
     looks = (found.front.look, found.beyond.look, rim.inner)
     places = [_place(view, pieces.pixel, look) for look in looks]
-    near, behind, inner = stored([_colors(view.image, place) for place in places])
+    near, behind, inner = stored_together([_colors(view.image, place) for place in places])
     centre, bare = _place(view, pieces.pixel, 4), view.background
     bare = bare[:, None] if bare.ndim == 1 else _colors(bare, centre)
     behind = jnp.where(found.beyond.face == BACKGROUND, bare, behind)
@@ -211,7 +212,7 @@ def with_pieces(
     outward = jnp.where(found.front_on_right, -1, 1)
     across = found.end - found.begin
     area, length = outward * _area(found.begin, found.end), jnp.hypot(*across)
-    area, length = stored((area, length))
+    area, length = stored_together((area, length))
     smooth = jnp.zeros_like(found.visible)
     if method.shader is None:
         jump = behind - front
@@ -224,7 +225,7 @@ def with_pieces(
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
-        turn = length * (integral - jnp.mean(rim.reaches, axis=0) * near)
+        turn = length * (integral - _mean(rim.reaches) * near)
         own = _colors(view.image, centre)
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         if view.meaned is not None:
@@ -233,7 +234,7 @@ def with_pieces(
             value = jnp.where(first, area * (behind - own), value)
             value = jnp.where(second, value + area * (own - behind), value)
         value = jnp.where(found.wrong_side, value + front - own, value)
-    jump, value, front, behind = stored((jump, value, front, behind))
+    jump, value, front, behind = stored_together((jump, value, front, behind))
     size = reduce(jnp.maximum, jnp.abs(behind) + jnp.abs(front))
     used = found.visible & (found.fold | (reduce(jnp.maximum, jnp.abs(jump)) > _NO_JUMP * size))
     held = front, behind, jnp.where(smooth, inner, front)
@@ -259,7 +260,7 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
     area = stored(_area(line.begin, line.end))
     places = [_place(view, line.pixel, look) for look in line.look]
     if method.shader is None:
-        right, left = stored([_colors(view.image, place) for place in places])
+        right, left = stored_together([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
         right, left = _shade(view, method, None, *points)
@@ -279,7 +280,7 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     assert view.cast is not None
     area = stored(_area(line.begin, line.end))
     colors = method.glow(view.scene, line.light, line.face, line.barycentrics)
-    glow = assemble(colors, first=True)
+    glow = jnp.stack(stored_together(colors))
     jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
     own = stored(_colors(view.image, _place(view, line.pixel, 4)))
     to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
@@ -345,13 +346,12 @@ def _along(
         at = jnp.clip(rim.reaches, begin, end) - begin
         share = at / jnp.maximum(end - begin, _SHALLOW)
         share = at * jnp.where(straight, share / 2, 2 / 3 * jnp.sqrt(share))
-        weight = jnp.mean(share, axis=0)
-        return jnp.mean(at, axis=0) * colors[0] + weight * (colors[1] - colors[0])
+        return _mean(at) * colors[0] + _mean(share) * (colors[1] - colors[0])
 
     integral = between(jnp.zeros_like(first), first, (front, bend), jnp.ones_like(passes))
     integral += between(first, centre, (bend, near), rim.single)
     integral += between(centre, depth, (near, far), passes | rim.single)
-    integral += jnp.mean(jnp.maximum(rim.reaches - depth, 0), axis=0) * far
+    integral += _mean(jnp.maximum(rim.reaches - depth, 0)) * far
 
     def moved(at: Array) -> Array:
         share = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))
@@ -359,6 +359,11 @@ def _along(
 
     leaving, entering = (moved(at) for at in rim.border)
     return integral, leaving + (rim.weight - 1) * (leaving - entering)
+
+
+def _mean(rows: Float[Array, "rows n"]) -> Float[Array, " n"]:
+    """The mean of rows, without the pass that XLA makes of every reduction."""
+    return reduce(jnp.add, list(rows)) / rows.shape[0]
 
 
 def cropped(colors: Array, shape: tuple[int, ...]) -> Array:

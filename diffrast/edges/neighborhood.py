@@ -1,13 +1,17 @@
 """What may lie near a piece of an edge: pixels round it, and faces round faces."""
 
+from functools import reduce
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import draws_on_cpu, in_strides
 from diffrast._selection import compacted, over_batches
-from diffrast._stored import stored
-from diffrast.edges.planes import Table, corners_of, edge_values
+from diffrast._stored import stored, stored_together
+from diffrast._topology import by_three
+from diffrast.edges.planes import Table, corners_of, covers, edge_values
 
 _STEPS = 40
 _WAYS_AT_ONCE = 512
@@ -35,13 +39,14 @@ def pixel_at(
 
 def steps_to(look: Int[Array, "*n"]) -> Int[Array, "2 *n"]:
     """Columns and rows from the middle one of the 3×3 pixels to another, 0 to 8."""
-    return jnp.stack([look % 3 - 1, look // 3 - 1])
+    row, column = by_three(look)
+    return jnp.stack([column - 1, row - 1])
 
 
 def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:
     """The values of the 3×3 pixels round each pixel of an image with a border, shape (9, n)."""
-    nine = jnp.arange(9)[:, None]
-    return image[row + nine // 3, column + nine % 3]
+    down, right = np.indices((3, 3)).reshape(2, 9, 1)
+    return image[row + down, column + right]
 
 
 def blocks_with_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
@@ -98,22 +103,23 @@ def walk(
     """
     shape, number = face.shape, jnp.arange(face.size, dtype=jnp.int32)
     order, count = compacted((face >= 0).reshape(-1), number)
-    face, x, y = stored((face.reshape(-1), x.reshape(-1), y.reshape(-1)))
+    face, x, y = stored_together((face.reshape(-1), x.reshape(-1), y.reshape(-1)))
 
     def go(way: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        start, to_x, to_y = stored((face[way], x[way], y[way]))
+        start, to_x, to_y = stored_together((face[way], x[way], y[way]))
         facing = stored(jnp.sign(volume[start]))  # the same all the way
 
         def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             steps, face, there = state
-            values = jnp.stack(edge_values(corners_of(face, faces, pixels), to_x, to_y)[0])
+            values, _ = edge_values(corners_of(face, faces, pixels), to_x, to_y)
             beside = stored(neighbors.T[:, jnp.maximum(face, 0)])
             goes_on = turned_alike(beside, facing, volume)
-            aside = stored(jnp.where(goes_on, jnp.minimum(values, 0), 0))
-            best = (aside < 0) & (aside == jnp.min(aside, axis=0))
-            following = jnp.max(jnp.where(best, beside, -1), axis=0)
-            there = there | (face < 0) | jnp.all(values >= 0, axis=0)
-            return steps + 1, *stored((jnp.where(there, face, following), there))
+            aside = [jnp.where(goes_on[i], jnp.minimum(values[i], 0), 0) for i in range(3)]
+            least = reduce(jnp.minimum, aside)
+            best = [(value < 0) & (value == least) for value in aside]
+            following = reduce(jnp.maximum, [jnp.where(best[i], beside[i], -1) for i in range(3)])
+            there = there | (face < 0) | covers(values)
+            return steps + 1, *stored_together((jnp.where(there, face, following), there))
 
         def is_on_the_way(state: tuple[Array, Array, Array]) -> Array:
             steps, _, there = state

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import Columns
 
@@ -58,7 +58,7 @@ def first_part(candidates: Candidates, fold: Bool[Array, " n"]) -> Part:
     entered = jnp.min(jnp.where(reaches & (high >= one[0]), low, 1), axis=0)
     change = jnp.where(ends_first, left, entered)
     changes = fold & (one[2] != other[2]) & (change > t[0]) & (change < t[2])
-    return Part(*stored((begin, jnp.where(changes, change, end), last)))
+    return Part(*stored_together((begin, jnp.where(changes, change, end), last)))
 
 
 def nearest_behind(

@@ -20,8 +20,8 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import compacted, prefix_sum, selected
-from diffrast._stored import stored
-from diffrast._topology import Edges
+from diffrast._stored import stored, stored_together
+from diffrast._topology import Edges, by_three
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
 PIECES_AT_ONCE = 256, 512
@@ -133,7 +133,7 @@ def facing(pixels: Table, faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     eye. But if their outlines touch, as those of faces without area do, they count as front faces:
     so one of the faces beside them has an outline there, and not both.
     """
-    first, second, third = nearest_first(stored([pixels[:, column] for column in faces.T]))
+    first, second, third = nearest_first(stored_together([pixels[:, column] for column in faces.T]))
     one, other = second - first, third - first
     cycles = [(i, (i + 1) % 3, (i + 2) % 3) for i in range(3)]
     terms = [first[i] * one[j] * other[k] for i, j, k in cycles]
@@ -195,8 +195,8 @@ def clip_edges(
     edges = Edges(*(column[chosen] for column in edges))
     drawn, right, fold = _sides(edges, volume)
     corners = edges.corners.T
-    vertices = stored(faces[edges.faces[:, 0], jnp.stack([corners[0] // 3, corners[0] % 3])])
-    at, z = stored((pixels[:, vertices], z[vertices]))  # (3, 2, n), (2, n)
+    vertices = stored(faces[edges.faces[:, 0], jnp.stack(by_three(corners[0]))])
+    at, z = stored_together((pixels[:, vertices], z[vertices]))  # (3, 2, n), (2, n)
 
     x, y, w = at
     heights = [w + z, w - z, x, width * w - x, y, height * w - y]
@@ -230,10 +230,11 @@ def positive_part(first: Sequence[Array], last: Sequence[Array]) -> tuple[Array,
     """
     begin, end = jnp.zeros_like(first[0]), jnp.ones_like(first[0])
     for a, b in zip(first, last, strict=True):
-        crossing = a / jnp.where((a < 0) == (b < 0), 1, a - b)
+        # At most one it is anyway; of a division itself XLA would make a pass of its own.
+        crossing = jnp.minimum(a / jnp.where((a < 0) == (b < 0), 1, a - b), 1)
         begin = jnp.where(a < 0, jnp.where(b < 0, 2, jnp.maximum(begin, crossing)), begin)
         end = jnp.where((a >= 0) & (b < 0), jnp.minimum(end, crossing), end)
-    return stored((begin, end))
+    return stored_together((begin, end))
 
 
 def _forward(ends: Array) -> tuple[Array, Array]:
@@ -280,7 +281,7 @@ def cut(
     pixel = jnp.where(turned, -column_row - 1, column_row).astype(jnp.int32)
     size = jnp.array([width, height])[:, None]
     inside = jnp.all((pixel >= 0) & (pixel < size), axis=0)
-    pixel, range_ = stored((pixel, range_))
+    pixel, range_ = stored_together((pixel, range_))
     return Pieces(segment, pixel, range_, exists & inside & (range_[0] < range_[1]))
 
 

@@ -24,7 +24,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round, steps_to, walk
 from diffrast.edges.pieces import positive_part
@@ -180,7 +180,7 @@ def _candidates(
     total = jnp.sum(lambdas[0], axis=0)
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
-    face, lambdas, fine = stored((face, lambdas * unit, size < _FINE))
+    face, lambdas, fine = stored_together((face, lambdas * unit, size < _FINE))
     return _Planes(face, body, look, lambdas, known, fine), unit, met
 
 
@@ -240,7 +240,7 @@ def _meeting(
         # Else the next walks would be these again.
         changes = jnp.any((reached != pair) | (now != arrived), axis=0)
         searched = searched & ~met & changes
-        return n + 1, *stored((reached, searched, now, met, following))
+        return n + 1, *stored_together((reached, searched, now, met, following))
 
     def is_left(state: _Search) -> Array:
         return (state[0] < _WALKS) & jnp.any(state[2])
@@ -257,7 +257,7 @@ def _lambdas(pixel: Array, face: Array, faces: Array, pixels: Table) -> tuple[Ar
     """λ of faces at the pixel's centre and its slopes, (3, 3 corners, ...); the volume; areas."""
     x, y, w = corners = corners_of(face, faces, pixels)
     centre = pixel + 0.5
-    u, v = stored((x - centre[0] * w, y - centre[1] * w))
+    u, v = stored_together((x - centre[0] * w, y - centre[1] * w))
     turns = [(1, 2), (2, 0), (0, 1)]
     values = [u[i] * v[j] - u[j] * v[i] for i, j in turns]
     volume = values[0] * w[0] + values[1] * w[1] + values[2] * w[2]
@@ -292,7 +292,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     """The lines along which these pairs of faces pierce each other, where they are visible."""
     at_once = crossings.unit.size
     one, other, place = pair // at_once // _FACES, pair // at_once % _FACES, pair % at_once
-    pixel, planes = stored(
+    pixel, planes = stored_together(
         jax.tree.map(lambda part: part[..., place], (crossings.pixel, crossings.planes))
     )
 
@@ -315,7 +315,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
         return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
 
     low, high = positive_part(*(list(inside(*(point + r * along))) for r in (-_REACH, _REACH)))
-    first, last = stored((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
+    first, last = stored_together((_REACH * (2 * low - 1), _REACH * (2 * high - 1)))
     begin, end = point + first * along, point + last * along
     x, y = stored((begin + end) / 2)
     values = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)

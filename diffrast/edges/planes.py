@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
+from diffrast._topology import by_three
 
 TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
@@ -65,10 +66,11 @@ def edge_values(
     if near is not None:
         volume = stored(edge_functions(corners, *near)[1])
     sign = jnp.where(volume < 0, -1, 1)
-    values = stored([value * sign for value in e])
+    values = [value * sign for value in e]
     total = values[0] + values[1] + values[2]
     depth = jnp.where(volume == 0, -1, total / jnp.where(volume == 0, 1, abs(volume)))
-    return values, stored(depth)
+    *values, depth = stored_together([*values, depth])
+    return values, depth
 
 
 def lowest(values: Columns) -> tuple[Array, Int[Array, "*n"]]:
@@ -84,7 +86,8 @@ def edge_functions(corners: Array, x: Array, y: Array) -> tuple[Columns, Array]:
     The value of a corner belongs to the edge opposite to it.
     """
     w = corners[2]
-    u, v = corners[0] - x * w, corners[1] - y * w
+    u = [corner - x * w[i] for i, corner in enumerate(corners[0])]
+    v = [corner - y * w[i] for i, corner in enumerate(corners[1])]
     e = [
         u[1] * v[2] - u[2] * v[1],
         u[2] * v[0] - u[0] * v[2],
@@ -131,5 +134,5 @@ def area(corners: Array) -> Array:
 
 def on_edge(edge: Int[Array, " n"], s: Array) -> Columns:
     """Barycentric coordinates a part `s` of the way along an edge from corner i to j, 3 i + j."""
-    start, end = edge // 3, edge % 3
+    start, end = by_three(edge)
     return [jnp.where(start == j, 1 - s, jnp.where(end == j, s, 0)) for j in range(3)]

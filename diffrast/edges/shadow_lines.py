@@ -26,7 +26,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import selected
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast.edges.neighborhood import first_row, picked, pixels_round, steps_to
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
@@ -292,7 +292,7 @@ def _unlike(values: Array, used: Array, count: int) -> tuple[Int[Array, "count n
     new = used & ~again
     number = jnp.where(new, jnp.cumsum(new, axis=0) - 1, -1)
     rows = jnp.stack([first_row(number == k) for k in range(count)])
-    return stored((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
+    return stored_together((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
 
 
 def _shared(faces: Array, face: Array, exists: Array, is_own: Array) -> list[Array]:
@@ -325,19 +325,21 @@ def shadow_of(
     def one(values: Array) -> Array:
         return values[..., edge, column, place]
 
-    (light, rows_of_light, pixel), source, weight = stored(
+    (light, rows_of_light, pixel), source, weight = stored_together(
         jax.tree.map(
             lambda values: values[..., place],
             (outlines.places, outlines.source, outlines.weight),
         )
     )
-    face, corners = stored((outlines.face[column, place], outlines.corners[..., column, place]))
+    face, corners = stored_together(
+        (outlines.face[column, place], outlines.corners[..., column, place])
+    )
     centre_is_lit, alone = outlines.centre_is_lit[place], outlines.alone[place]
-    start, end = stored((of_edge(outlines.ends[0]), of_edge(outlines.ends[1])))
+    start, end = stored_together((of_edge(outlines.ends[0]), of_edge(outlines.ends[1])))
     ground, shadow = _face_plane(corners), _shadow_plane(source, weight, start, end)
     normal, foot, inverse = _line(ground, shadow)
     along = jnp.stack([-normal[1], normal[0]])
-    low, high = stored((one(outlines.range[0]), one(outlines.range[1])))
+    low, high = stored_together((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
     from_centre = _dot(foot, normal)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
 from diffrast.edges.neighborhood import (
     first_row,
@@ -97,7 +97,7 @@ def uncovered(
     """
     column, row = pieces.pixel
     face = stored(face_image[row + 1, column + 1])
-    own, weights, ends = stored(
+    own, weights, ends = stored_together(
         (
             segments.faces[:, pieces.segment],
             segments.weights[:, pieces.segment],
@@ -111,7 +111,7 @@ def uncovered(
     sides = jnp.stack([-aside, aside])
     x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
     y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
-    x, y = stored((x, y))
+    x, y = stored_together((x, y))
     corners = corners_of(face, faces, pixels)[:, :, None, None]
     values, depth = edge_values(corners, x, y, near=(x[0, 0], y[0, 0]))
     own_depth = weights[0] + pieces.range * (weights[1] - weights[0])
@@ -138,24 +138,24 @@ def look(
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
     one pixel all round; `bare_blocks` are those of `blocks_with_background`.
     """
-    own, own_corners, fold, weights, ends, range_ = stored(
+    own, own_corners, weights, *ends, range_, fold, first_on_right = stored_together(
         (
             segments.faces[:, pieces.segment],
             segments.corners[:, pieces.segment],
-            segments.fold[pieces.segment],
             segments.weights[:, pieces.segment],
-            segments.ends[..., pieces.segment],
+            *segments.ends[..., pieces.segment],
             segments.range[:, pieces.segment],
+            segments.fold[pieces.segment],
+            segments.first_on_right[pieces.segment],
         )
     )
-    first_on_right = segments.first_on_right[pieces.segment]
     # From the pixel's centre; the normal points to the right, y downwards as everywhere here.
     centre = pieces.pixel + 0.5
     start, along = ends[0] - centre, ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     inverse_length = 1 / jnp.where(length > 0, length, 1)
     normal = jnp.stack([along[1] * inverse_length, -along[0] * inverse_length])
-    start, normal, length = stored((start, normal, length))
+    start, normal, length = stored_together((start, normal, length))
 
     def inverse_depth(t: Array) -> Array:
         return (1 - t) * weights[0] + t * weights[1]
@@ -169,7 +169,7 @@ def look(
     front_corners, other_corners = jnp.where(use_first, own_corners, own_corners[::-1])
     front_on_right = jnp.where(use_first | fold, first_on_right, ~first_on_right)
     outward = jnp.where(front_on_right, -1, 1)
-    front, other, outward = stored((front, other, outward))
+    front, other, outward = stored_together((front, other, outward))
     out = stored(outward * normal)
 
     t = (pieces.range[0] + pieces.range[1]) / 2
@@ -183,7 +183,7 @@ def look(
     inside, outside = _beside_edge(face_image.shape, length.dtype)
     offset = jnp.stack([-jnp.minimum(inside, thickness / 2) * out, outside * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
-    x, y = stored((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
+    x, y = stored_together((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
     around_corners = corners_of(around, faces, pixels)
     values, depth = edge_values(around_corners[:, :, None, None], x, y, near=(centre[0], centre[1]))
     patch = stored(topology.patches[jnp.maximum(around, 0)])
@@ -208,8 +208,8 @@ def look(
     left = pieces._replace(
         range=jnp.stack([high, end]), exists=exists & ((end - high) * length > SHORT)
     )
-    visible, low, high, t, left = stored((exists, low, high, t, left))
-    begin, end, middle = stored([start + at * along for at in (low, high, t)])
+    visible, low, high, t, left = stored_together((exists, low, high, t, left))
+    begin, end, middle = stored_together([start + at * along for at in (low, high, t)])
     near = stored(inverse_depth(t))
 
     # What is behind.
@@ -231,11 +231,13 @@ def look(
     shift = stored(jnp.where(close, outward * is_beyond * _SNAPPED - to_right, 0))
     centre_depth = -outward * (to_right + shift)
     wrong_side = wrong_side & close
-    begin, end, centre_depth = stored((begin - shift * normal, end - shift * normal, centre_depth))
+    begin, end, centre_depth = stored_together(
+        (begin - shift * normal, end - shift * normal, centre_depth)
+    )
     beyond_centre = centre_depth < 0
     front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
-    front_look, beyond_look = stored((front_look, beyond_look))
+    front_look, beyond_look = stored_together((front_look, beyond_look))
     tiny = stored(area(around_corners[:, :, :9])) < _FINE
     before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     above = tiny & before
@@ -284,7 +286,9 @@ def look(
 
     ways = jnp.stack([hiding, behind, other_behind, *jnp.where(alike & ~plain, ours, -1)])
     away = jnp.stack([outside * out] * 3 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
-    ways, (x, y) = stored((jnp.where(visible, ways, -1), (centre + middle)[:, None] + away))
+    ways, (x, y) = stored_together(
+        (jnp.where(visible, ways, -1), (centre + middle)[:, None] + away)
+    )
     reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
     arrives = stored(there & (reached >= 0))
     reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
@@ -354,7 +358,7 @@ def look(
         end=end,
         middle=t,
     )
-    return seen, left
+    return stored_together(seen), left
 
 
 def _beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:

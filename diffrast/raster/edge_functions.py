@@ -14,7 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from diffrast._compensated import difference_of_products
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast.raster.fixed_point import (
     FAR,
     GUARD_BITS,
@@ -59,12 +59,14 @@ class Corners(NamedTuple):
 def corners_of(vertices: Vertices, faces: Array, chunk: Array) -> Corners:
     """The corners of some faces."""
     corners = faces[chunk].T
-    sizes = _largest([column[corners] for column in (vertices.x, vertices.y, vertices.w)])
+    sizes = _largest(
+        stored_together([column[corners] for column in (vertices.x, vertices.y, vertices.w)])
+    )
     smallest = jnp.argmin(sizes, axis=0)
     # Own corner, start and end: each the next of the one before.
     turned = (jnp.arange(3)[:, None, None] + jnp.arange(3)[:, None] + smallest) % 3
     index = stored(corners[turned, jnp.arange(chunk.size)])
-    columns = [column[index] for column in vertices]
+    columns = stored_together([column[index] for column in vertices])
     own, start, end = (Vertices(*(column[k] for column in columns)) for k in range(3))
     return Corners(own, start, end, maximum3(list(sizes)))
 

@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._selection import batches_of
-from diffrast._stored import stored
+from diffrast._stored import stored, stored_together
 from diffrast.raster.edge_functions import (
     TILE,
     Edge,
@@ -136,10 +137,9 @@ def _resolve(
     return _put(buffer, new, corner)
 
 
-def _pixel_grid(block: tuple[int, int]) -> tuple[Array, Array]:
-    rows = jnp.arange(block[0], dtype=jnp.int32)[:, None]
-    columns = jnp.arange(block[1], dtype=jnp.int32)[None, :]
-    return columns, rows
+def _pixel_grid(block: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.ogrid[: block[0], : block[1]]
+    return columns.astype(np.int32), rows.astype(np.int32)
 
 
 # Faces that fit one block -------------------------------------------------------------------------
@@ -220,7 +220,7 @@ def _draw_sweeps(
     def draw_chunk(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         slots = first + n * CHUNK + jnp.arange(CHUNK)
         chunk = order[jnp.minimum(slots, order.shape[0] - 1)]
-        sweeps = stored(set_up(corners_of(vertices, faces, chunk), image, cull_backfaces))
+        sweeps = stored_together(set_up(corners_of(vertices, faces, chunk), image, cull_backfaces))
         walk = _plan_walk(sweeps, slots < stop, image)
 
         def hidden(tile: _Tile, lowest_keys: Array) -> Array:
