@@ -28,6 +28,11 @@ def lanes() -> int:
     return 1 if draws_on_cpu() else _OFF_CPU
 
 
+def at_once(some: int, total: int) -> int:
+    """How many of so many are worked off side by side: some on a CPU, elsewhere all of them."""
+    return min(some, total) if draws_on_cpu() else total
+
+
 def in_strides(step: Callable[[S], S]) -> Callable[[S], S]:
     """The step of a loop; elsewhere than on a CPU several steps, for which the loop asks only once.
 

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from diffrast._check import instance_of
 from diffrast._stored import assemble, interleaved, stored, stored_alone
 from diffrast._topology import Topology
+from diffrast.bending import Turning, find_turning
 from diffrast.camera import Camera, central_rays
 from diffrast.deferred import comes_held, shade_covered
 from diffrast.edges import View, antialias_image
@@ -38,7 +39,7 @@ from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 from diffrast.texture import CubeTexture
 from diffrast.texturing import paint_scene, seams, skybox
-from diffrast.turning import Turning, find_turning, with_turns
+from diffrast.turning import with_turns
 
 
 class Buffers(NamedTuple):

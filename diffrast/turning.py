@@ -17,12 +17,13 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Bool, Float, Int
 
-from diffrast._device import draws_on_cpu, over_views
+from diffrast._device import at_once, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of, compacted, over_batches
-from diffrast._stored import stored, stored_together, zero_after
+from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
+from diffrast.bending import Chosen, Turning, bending
 from diffrast.edges.neighborhood import walk
 from diffrast.edges.pieces import facing, to_pixels
 from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
@@ -31,18 +32,9 @@ from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, pixels_at
 from diffrast.shadows import Reached
 
-_Lists: TypeAlias = tuple[Array, Array, Array, Array]  # two, and the lengths of both
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
-PARTS_AT_ONCE = 1024
-_FEW = 128  # of them in small images
 _POINTS_AT_ONCE = 512  # that may be hidden
-_SHARE = 10  # of so many pixels at most one is shaded at more points
-_BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
-_PLAIN = 0.005  # of the same: what edges may add where they part nothing
-_ROWS = 8  # one of so many tells the mean
-_BLOCK = 16  # pixels, one below the other
-_BLOCKS_AT_ONCE = 64
 
 
 def _points() -> np.ndarray:
@@ -63,47 +55,10 @@ _STEEP = abs(_POINTS[1]) >= abs(_POINTS[0])
 _ASIDE = np.where([~_STEEP, _STEEP], np.sign(_POINTS), 0).astype(np.int32)  # the next pixel
 
 
-class Turning(NamedTuple):
-    """The picture without edges, with a border of one pixel, and where its colours turn."""
-
-    face_image: Int[Array, "height_with_border width_with_border"]  # what is seen, -1 for nothing
-    hard: Float[Array, "height_with_border width_with_border 3"]  # its colours
-    mean: Float[Array, ""]  # of the whole
-    chosen: Bool[Array, "height width"]  # pixels that get their surface's mean colour in any case
-
-
-class _Chosen(NamedTuple):
-    """The pixels that are shaded at more points, those that edges part last.
-
-    These have no derivative here, and are shaded in four quarters if there is room.
-    """
-
-    number: Int[Array, " places"]
-    plain: Int[Array, ""]  # so many that edges do not part,
-    total: Int[Array, ""]  # and all
-
-    @property
-    def at_once(self) -> int:
-        """How many parts of pixels are shaded side by side."""
-        places = self.number.size
-        return min(places, PARTS_AT_ONCE) if draws_on_cpu() else places
-
-    @property
-    def parts_of_each(self) -> Int[Array, ""]:
-        """In how many parts those pixels are shaded that edges part."""
-        parts = self.plain + 4 * (self.total - self.plain)
-        return jnp.where(parts <= self.number.size, 4, 1)
-
-    @property
-    def parts(self) -> Int[Array, ""]:
-        """How many there are of all pixels."""
-        return self.plain + self.parts_of_each * (self.total - self.plain)
-
-
 class _Points(NamedTuple):
     """What is seen there."""
 
-    chosen: _Chosen
+    chosen: Chosen
     face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
     reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
 
@@ -122,28 +77,6 @@ class _Inputs(NamedTuple):
     data: Any
     drawn: Drawn
     points: _Points
-
-
-def find_turning(
-    face_image: Int[Array, "height_with_border width_with_border"],
-    hard: Float[Array, "height_with_border width_with_border 3"],
-) -> Turning:
-    """Where colours bend most in an image without edges: at no more than one of 20 pixels."""
-
-    def find(face_image: Array, hard: Array) -> tuple[Array, Array]:
-        color = _sums(hard)
-        some = slice(_ROWS // 2, None, _ROWS)
-        seen = face_image[some] >= 0
-        mean = jnp.sum(jnp.where(seen, abs(color[some]), 0)) / jnp.maximum(jnp.sum(seen), 1)
-        bends = _bends(jnp.where(face_image >= 0, color, jnp.nan))
-
-        def are_many(least: Array) -> Array:
-            return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
-
-        return mean, bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
-
-    seen = lax.stop_gradient((face_image, hard))
-    return Turning(*seen, *over_views(lambda _: find, face_image.size)(*seen))
 
 
 def with_turns(
@@ -182,15 +115,15 @@ def with_turns(
         topology: Topology,
         apart: Array,
     ) -> _Points:
-        chosen = _bending(turning, image)
+        chosen = bending(turning, image)
         row, column = jnp.divmod(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
         face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart)
         return _Points(chosen, face, lit)
 
-    seen = lax.stop_gradient((turning, image, reached, drawn.positions_clip))
+    seen = lax.stop_gradient((image, reached, drawn.positions_clip))
     surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart
-    points = over_views(lambda _: find, height * width)(*seen, *surface)
+    points = over_views(lambda _: find, height * width)(turning, *seen, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     number, _, total = points.chosen
     place = jnp.arange(number.size)
@@ -199,97 +132,7 @@ def with_turns(
     return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
 
-def _sums(image: Array) -> Array:
-    return image[..., 0] + image[..., 1] + image[..., 2]
-
-
-def _least(mean: Array) -> Array:
-    """Of what is chosen; doubled, it must not stay zero."""
-    return jnp.maximum(_BEND * mean, jnp.finfo(mean.dtype).tiny)
-
-
-def _places(image: Array) -> int:
-    """For how many pixels of an image there is room."""
-    most = -(-image.size // _SHARE)
-    unit = PARTS_AT_ONCE if most > PARTS_AT_ONCE else _FEW
-    return -(-most // unit) * unit
-
-
-def _bending(turning: Turning, image: Array) -> _Chosen:
-    """Those where colours bend most."""
-    face_image, hard, mean, chosen = turning
-    changes = stored(_sums(jnp.abs(image - hard[1:-1, 1:-1])))
-    parted = stored(changes > _PLAIN * mean)
-    # What the background shows, or an edge changes, is not a number.
-    color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
-    bends = stored(jnp.where(chosen, jnp.inf, _bends(color)))
-    return _largest(bends, _least(mean), parted)
-
-
-def _bends(color: Array) -> Array:
-    """By how much more colours change to one side of each pixel but those at the border."""
-    color = stored(color)
-    middle = color[1:-1, 1:-1]
-    across = _bend(color[1:-1, :-2], middle, color[1:-1, 2:])
-    down = _bend(color[:-2, 1:-1], middle, color[2:, 1:-1])
-    bends = jnp.fmax(across, down)
-    return stored(jnp.where(bends == bends, bends, 0))
-
-
-def _bend(one: Array, middle: Array, other: Array) -> Array:
-    """By how much more a colour changes to one side; by how much, if only one side is known."""
-    to_one, to_other = one - middle, other - middle
-    both = to_one + to_other
-    alone = jnp.where(to_one == to_one, to_one, to_other)
-    return jnp.abs(jnp.where(both == both, both, alone))
-
-
-def _largest(values: Array, least: Array, last: Array) -> _Chosen:
-    """The pixels with more than the least value, those of which `last` is true behind the others.
-
-    If these are too many, those with more than twice, four times, ... as much. Blocks of pixels
-    one below the other are looked through: their largest values are quick to find.
-    """
-    height, width = values.shape
-    places = _places(values)
-    blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
-    blocks = jnp.max(blocks, axis=1).reshape(-1)
-
-    def are_few(found: _Lists) -> Array:
-        return found[2] + found[3] <= places
-
-    def look(state: tuple[Array, _Lists]) -> tuple[Array, _Lists]:
-        least, (ahead, behind, _, _) = state
-        order, size = compacted(blocks > least, jnp.arange(blocks.size, dtype=jnp.int32))
-
-        def add(block: Array, exists: Array, found: _Lists) -> _Lists:
-            ahead, behind, before, after = found
-            first = block // width * _BLOCK * width + block % width
-            number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
-            value = values.reshape(-1).at[number].get(mode="fill", fill_value=0)
-            chosen = stored(exists & (value > least)).reshape(-1)
-            is_last = last.reshape(-1).at[number].get(mode="clip").reshape(-1)
-            one, more = compacted(chosen & ~is_last, number.reshape(-1))
-            other, rest = compacted(chosen & is_last, number.reshape(-1))
-            ahead = lax.dynamic_update_slice(ahead, one, (before,))
-            behind = lax.dynamic_update_slice(behind, other, (after,))
-            return ahead, behind, before + more, after + rest
-
-        zero = zero_after(size)
-        start = jnp.zeros_like(ahead), jnp.zeros_like(behind), zero, zero
-        return 2 * least, over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
-
-    zero = zero_after(blocks[0]).astype(jnp.int32)
-    room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
-    start = least, (room, room, zero + places + 1, zero)
-    _, found = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    ahead, behind, before, after = found
-    place = jnp.arange(places)
-    number = jnp.where(place < before, ahead[place], behind[jnp.maximum(place - before, 0)])
-    return _Chosen(number, before, before + after)
-
-
-def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
+def _parts(chosen: Chosen, n: Array, count: Array) -> _Parts:
     """The batch `n` of so many parts."""
     size = chosen.at_once
     number = n * size + jnp.arange(size, dtype=jnp.int32)
@@ -300,14 +143,12 @@ def _parts(chosen: _Chosen, n: Array, count: Array) -> _Parts:
     return _Parts(*stored_together((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
 
 
-def _over_parts(
-    chosen: _Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any
-) -> Any:
+def _over_parts(chosen: Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any) -> Any:
     return lax.fori_loop(0, batches_of(count, chosen.at_once), step, start)
 
 
 def _faces_at(
-    chosen: _Chosen,
+    chosen: Chosen,
     face_image: Array,
     clip: Array,
     faces: Array,
@@ -386,8 +227,8 @@ def _unhidden(
         hidden = there & (end >= 0) & is_before(end, x, y, FINE_TOLERANCE)
         return seen.at[jnp.where(hidden, number, seen.size)].set(-1, mode="drop")
 
-    at_once = _POINTS_AT_ONCE if draws_on_cpu() else seen.size
-    return over_batches(order, count, at_once, hide, seen.reshape(-1)).reshape(seen.shape)
+    some = at_once(_POINTS_AT_ONCE, seen.size)
+    return over_batches(order, count, some, hide, seen.reshape(-1)).reshape(seen.shape)
 
 
 def _together(topology: Topology, apart: Array) -> Array:

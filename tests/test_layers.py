@@ -103,6 +103,7 @@ ORDER = [
     "diffrast.lines",
     "diffrast.surface",
     "diffrast.deferred",
+    "diffrast.bending",
     "diffrast.turning",
     "diffrast.render",
     "diffrast.recolor",

@@ -7,7 +7,7 @@ import pytest
 from test_render import operations, times
 
 import diffrast as dr
-from diffrast import turning
+from diffrast import bending, turning
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -62,8 +62,8 @@ def test_whatever_edges_are_told_of_gets_its_mean(rough):
     )
     hard = jnp.asarray(0.5 + noise, jnp.float32)
     parts = rng.uniform(size=(height, width, 1)) < 0.3
-    found = turning.find_turning(face, hard)
-    number, plain, total = turning._bending(found, hard[1:-1, 1:-1] + 0.1 * parts)
+    found = bending.find_turning(face, hard)
+    number, plain, total = bending.bending(found, hard[1:-1, 1:-1] + 0.1 * parts)
     listed = np.asarray(number[:total])
     assert 0 < plain < total <= number.size < height * width / 2
     assert len(set(listed)) == total
@@ -105,15 +105,15 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
     added = turning._added
     with monkeypatch.context() as patch:
         patch.setattr(turning, "_added", watched)
-        patch.setattr(turning, "PARTS_AT_ONCE", 32)
-        patch.setattr(turning, "_FEW", 32)
+        patch.setattr(bending, "PARTS_AT_ONCE", 32)
+        patch.setattr(bending, "_FEW", 32)
         dr.render.__wrapped__(scene(), camera(), settings(40))
         ((shade, size, inputs),) = found
         chosen = inputs.points.chosen
         assert 32 < chosen.plain < chosen.total <= chosen.number.size
 
         def colors(vertices, direction, at_once):
-            patch.setattr(turning, "PARTS_AT_ONCE", at_once)
+            patch.setattr(bending, "PARTS_AT_ONCE", at_once)
             attributes = (vertices, *inputs.drawn.attributes[1:])
             (light,) = inputs.data.scene.lights
             placed = inputs.drawn.placed._replace(attributes=attributes)

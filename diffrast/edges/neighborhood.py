@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._device import draws_on_cpu, in_strides
+from diffrast._device import at_once, in_strides
 from diffrast._selection import compacted, over_batches
 from diffrast._stored import stored, stored_together
 from diffrast._topology import by_three
@@ -133,6 +133,6 @@ def walk(
         return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
 
     nowhere = jnp.minimum(face, -1), face < 0
-    at_once = _WAYS_AT_ONCE if draws_on_cpu() else face.size
-    ends, arrived = over_batches(order, count, at_once, go, nowhere)
+    some = at_once(_WAYS_AT_ONCE, face.size)
+    ends, arrived = over_batches(order, count, some, go, nowhere)
     return ends.reshape(shape), arrived.reshape(shape)
