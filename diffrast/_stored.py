@@ -44,19 +44,30 @@ def stored(values: T, witness: Array | None = None) -> T:
 
 
 def stored_together(values: T) -> T:
-    """The same, with one pass for small arrays of one shape on a CPU.
+    """The same, on a CPU with one pass for small arrays of one shape.
 
     Under `vmap` their last bits may be others: it is meant for what takes one view after another.
     """
     leaves, tree = jax.tree.flatten(values)
-    groups: dict[Any, list[int]] = {}
-    for i, leaf in enumerate(leaves):
-        alone = leaf.size > _SMALL or not draws_on_cpu()
-        groups.setdefault((i, "alone") if alone else leaf.shape, []).append(i)
-    for group in groups.values():
+    for group in _groups(leaves):
         for i, value in zip(group, _stored(*(leaves[i] for i in group)), strict=True):
             leaves[i] = value
     return jax.tree.unflatten(tree, leaves)
+
+
+def _groups(leaves: list[Array]) -> list[list[int]]:
+    """Which arrays are written in one pass; XLA allows for one precision of floats in each."""
+    groups: dict[Any, list[int]] = {}
+    precision: dict[tuple[int, ...], jnp.dtype] = {}
+    for leaf in leaves:
+        if jnp.issubdtype(leaf.dtype, jnp.inexact):
+            precision.setdefault(leaf.shape, leaf.dtype)
+    for i, leaf in enumerate(leaves):
+        own = jnp.issubdtype(leaf.dtype, jnp.inexact)
+        key = leaf.shape, leaf.dtype if own else precision.get(leaf.shape)
+        alone = leaf.size > _SMALL or not draws_on_cpu()
+        groups.setdefault(i if alone else key, []).append(i)
+    return list(groups.values())
 
 
 def _one(witness: Array, dtype: jnp.dtype) -> Array:

@@ -47,6 +47,13 @@ def test_not_a_bit_changes(function, transform):
         np.testing.assert_array_equal(bits(kept), bits(value))
 
 
+def test_arrays_of_several_precisions_are_kept():
+    half = NUMBERS.astype(jnp.float16)
+    kept = jax.jit(stored_together)((NUMBERS, half, INTEGERS, INTEGERS.astype(jnp.int8)))
+    for value, given in zip(kept[:3], (NUMBERS, half, INTEGERS), strict=True):
+        np.testing.assert_array_equal(bits(value), bits(given))
+
+
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere XLA does so by itself")
 def test_small_arrays_of_one_shape_are_computed_in_one_pass():
     def three(function, size):
