@@ -56,7 +56,7 @@ def test_arrays_of_several_precisions_are_kept():
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere XLA does so by itself")
 def test_small_arrays_of_one_shape_are_computed_in_one_pass():
-    def three(function, size):
+    def kernels(function, size):
         def values(x):
             shared = jnp.sqrt(1 + x * x)
             return function({"x": x / shared, "one": 1 / shared, "long": shared > 2})
@@ -64,8 +64,8 @@ def test_small_arrays_of_one_shape_are_computed_in_one_pass():
         program = jax.jit(values).lower(jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
         return program.as_text().count(" fusion(")
 
-    assert three(stored_together, 512) == 1 < three(stored, 512)
-    assert three(stored_together, 100_000) > 1
+    assert kernels(stored_together, 512) == 1 < kernels(stored, 512)
+    assert kernels(stored_together, 100_000) > 1
 
 
 @pytest.mark.parametrize("function", [stored, stored_together])
