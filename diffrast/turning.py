@@ -170,9 +170,10 @@ def _faces_at(
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(chosen, n, count)
             row, column = stored(jnp.divmod(chosen.number[place], width - 2))
+            x0, y0 = (at.astype(clip.dtype) + 1.5 for at in (column, row))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
             right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
-            point = x, y = stored_together((column + 1.5 + right, row + 1.5 + down))
+            point = x, y = stored_together((x0 + right, y0 + down))
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             own = jnp.broadcast_to(centre, x.shape)
@@ -182,7 +183,7 @@ def _faces_at(
             beside = stored(face_image[row + 1 + down, column + 1 + right])
             parted = exists & (place >= chosen.plain)
             beside = stored(jnp.where(parted & (beside != own), beside, -1))
-            seen = _unhidden(seen, beside, point, (column + 1.5 + right, row + 1.5 + down), surface)
+            seen = _unhidden(seen, beside, point, (x0 + right, y0 + down), surface)
             return lax.dynamic_update_slice_in_dim(found, seen, n * place.size, 1)
 
         return _over_parts(chosen, count, add, found)
@@ -336,6 +337,7 @@ def _of_parts(
     seen = points_at(drawn, pixels._replace(face=flat, x=x, y=y))
     colors = [color.reshape(face.shape) for color in shade(data, seen, lit)]
     used = (face[1:] >= 0) & parts.exists
-    share = jnp.where(parts.points > 0, 0.25, 1)  # of the pixel
+    quarter = jnp.array(0.25, x.dtype)
+    share = jnp.where(parts.points > 0, quarter, 1)  # of the pixel
     means = [jnp.mean(jnp.where(used, color[1:] - color[0], 0), axis=0) for color in colors]
     return jnp.stack([share * mean for mean in means], axis=-1)

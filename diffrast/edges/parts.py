@@ -41,7 +41,8 @@ class Part(NamedTuple):
 def first_part(candidates: Candidates, fold: Bool[Array, " n"]) -> Part:
     """The first part of pieces that nothing hides, with one surface behind it if it is a fold."""
     begin, end, last = _unhidden(candidates)
-    t = stored(begin + jnp.array([_SLIVER, 0.5, 1 - _SLIVER])[:, None] * (end - begin))
+    places = jnp.array([_SLIVER, 0.5, 1 - _SLIVER], begin.dtype)
+    t = stored(begin + places[:, None] * (end - begin))
     depth, best = nearest_behind(candidates, t)
     surface = jnp.where(depth > 0, jnp.take_along_axis(candidates.patch, best, axis=0), -1)
 

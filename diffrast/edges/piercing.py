@@ -218,7 +218,7 @@ def _meeting(
 
     `planes` (3, 2, n) are those of `pair`, as in `_two_bodies`, and `look` is where it is seen.
     """
-    centre = (pixel + 0.5)[:, None]
+    centre = (pixel.astype(pixels.dtype) + 0.5)[:, None]
     from_centre = steps_to(look)
 
     def meet(planes: Array) -> Array:
@@ -256,7 +256,7 @@ def _meeting(
 def _lambdas(pixel: Array, face: Array, faces: Array, pixels: Table) -> tuple[Array, Array, Array]:
     """λ of faces at the pixel's centre and its slopes, (3, 3 corners, ...); the volume; areas."""
     x, y, w = corners = corners_of(face, faces, pixels)
-    centre = pixel + 0.5
+    centre = pixel.astype(w.dtype) + 0.5
     u, v = stored_together((x - centre[0] * w, y - centre[1] * w))
     turns = [(1, 2), (2, 0), (0, 1)]
     values = [u[i] * v[j] - u[j] * v[i] for i, j in turns]
@@ -336,7 +336,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
     total = jnp.sum(in_front, axis=0)
 
-    centre = pixel + 0.5
+    centre = pixel.astype(depth.dtype) + 0.5
     plane = jnp.stack(
         [sums[1], sums[2], depth - (x + centre[0]) * sums[1] - (y + centre[1]) * sums[2]]
     )
@@ -365,7 +365,7 @@ def _kept_aside(
     to_front = -(point[0] * normal[0] + point[1] * normal[1])  # of the first face, as at the centre
     shown = jnp.where(at_centre == bodies[0], 1, jnp.where(at_centre == bodies[1], -1, 0))
     moves = jnp.any(whole, axis=0) & (shown * to_front < 0)
-    return stored(jnp.where(moves, -shown * _ASIDE * normal, point))
+    return stored(jnp.where(moves, -shown * (_ASIDE * normal), point))
 
 
 def _hidden(planes: _Planes, others: Array, x: Array, y: Array, depth: Array) -> Array:

@@ -158,7 +158,7 @@ def cross_shadows(
 ) -> Outlines:
     """Find the lines at these places: of each edge on each face on which its shadow may fall."""
     light, rows, pixel = places
-    centre = pixel + 0.5
+    centre = pixel.astype(pixels.dtype) + 0.5
 
     def place(vertex: Array) -> Array:
         """x, y and w of vertices, from the pixel's centre."""
@@ -429,7 +429,8 @@ def _nonzero(value: Array) -> Array:
 def _of_screen(motion: Array, pixel: Array) -> Array:
     """By x, y and w of the screen what is given by those from a pixel's centre."""
     x, y, w = motion
-    return jnp.stack([x, y, w - (pixel[0] + 0.5) * x - (pixel[1] + 0.5) * y])
+    column, row = pixel.astype(w.dtype) + 0.5
+    return jnp.stack([x, y, w - column * x - row * y])
 
 
 def _through(normal: Array, place: Array) -> _Plane:

@@ -150,7 +150,7 @@ def look(
         )
     )
     # From the pixel's centre; the normal points to the right, y downwards as everywhere here.
-    centre = pieces.pixel + 0.5
+    centre = pieces.pixel.astype(weights.dtype) + 0.5
     start, along = ends[0] - centre, ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     inverse_length = 1 / jnp.where(length > 0, length, 1)
@@ -190,7 +190,8 @@ def look(
     fine = jnp.min(area(face_corners), axis=0) < _FINE
     front_patch = stored(topology.patches[jnp.maximum(front, 0)])
     touching = (patch == front_patch) | fine
-    tolerance = stored(jnp.where(touching, FINE_TOLERANCE, TOLERANCE))
+    tolerance = jnp.array(TOLERANCE, depth.dtype)
+    tolerance = stored(jnp.where(touching, FINE_TOLERANCE, tolerance))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
         face=around,
@@ -228,7 +229,8 @@ def look(
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
-    shift = stored(jnp.where(close, outward * is_beyond * _SNAPPED - to_right, 0))
+    snapped = jnp.array(_SNAPPED, near.dtype)
+    shift = stored(jnp.where(close, outward * is_beyond * snapped - to_right, 0))
     centre_depth = -outward * (to_right + shift)
     wrong_side = wrong_side & close
     begin, end, centre_depth = stored_together(

@@ -72,8 +72,9 @@ class Texel(NamedTuple):
 def texel_of(pictures: Pictures, rays: Rays) -> Texel:
     """The texels in which rays begin."""
     last = pictures.face.shape[1] - 1
-    column, row = (jnp.clip(jnp.floor(at), 0, last).astype(jnp.int32) for at in (rays.x, rays.y))
-    return Texel(row, column, rays.x - (column + 0.5), rays.y - (row + 0.5))
+    column, row = (jnp.clip(jnp.floor(at), 0, last) for at in (rays.x, rays.y))
+    x, y = rays.x - (column + 0.5), rays.y - (row + 0.5)
+    return Texel(row.astype(jnp.int32), column.astype(jnp.int32), x, y)
 
 
 def number_of(

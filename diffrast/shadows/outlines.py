@@ -181,7 +181,7 @@ def _are_joined(
 
     Over faces that have a `volume`, to where the other pixel's centre shows it.
     """
-    row, column = jnp.mgrid[: face.shape[0], : face.shape[1]] + 0.5
+    row, column = jnp.mgrid[: face.shape[0], : face.shape[1]].astype(pixels.dtype) + 0.5
     x, y = jnp.stack([column + 1, column]), jnp.stack([row, row + 1])
     end, _ = walk(
         jnp.where(asked, face, -1).reshape(1, -1),
