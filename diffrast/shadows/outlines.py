@@ -22,7 +22,7 @@ from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked, walk
 from diffrast.edges.pieces import facing, to_pixels
-from diffrast.edges.planes import Table, edge_functions, lowest
+from diffrast.edges.planes import Table, barycentrics, edge_functions, lowest
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution, shone_on
@@ -32,9 +32,12 @@ from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
 _STEPS = 64  # from face to face
+_LOOKS = 8  # from one outline to the next
+_BEYOND = 1 / 64  # of the way from an outline to what is lit: where the next one is looked for
 
 _Search = tuple[Array, Array, Array, Array, Array]
-_State = tuple[Array, Array, Array, Array, Array, Array]
+_State = tuple[Array, Array, Array, Array, Array, Array, Array]
+_Look = tuple[Array, Rays, Array]
 
 
 class Parted(NamedTuple):
@@ -220,6 +223,39 @@ def _edge_between(
         x, y, w = seen(end)
         ends.append(stored([x / jnp.where(w > 0, w, 1), y / jnp.where(w > 0, w, 1)]))
     zero = jnp.zeros_like(at_dark[0])
+
+    def corners_of(face: Array) -> Array:
+        return seen(face_corners(geometry, face))
+
+    def look(state: _Look) -> _Look:
+        looks, rays, edge = state
+        way = [[rays.x, rays.y], ends[1]]
+        line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
+        nearby = faces_near(pictures, geometry, rays, line)
+        part, _, _ = _leaves(stored(seen(nearby.corners)), way)
+        part = stored(jnp.where((nearby.cut.stops > 0) & (part < 2), part, -1))
+        farthest = jnp.max(part, axis=0)
+        nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
+        row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
+        hidden = rays.asked & ((farthest >= 0) | (looks == 0))
+        face = jnp.where(hidden, picked(nearby.face, row), -1)
+        face = _covering(face, farthest < 0, topology.neighbors, corners_of, way[0])
+        following, end = _follow(face, topology.neighbors, corners_of, way)
+
+        # What hides the light there may end where something else still does.
+        end = end + _BEYOND * (1 - end)
+        x, y = (a + end * (b - a) for a, b in zip(*way, strict=True))
+        goes_on = following >= 0
+        ground = _covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
+        values, volume = edge_functions(corners_of(ground), x, y)
+        shares = barycentrics(values)
+        goes_on = goes_on & (jnp.min(jnp.stack(shares), axis=0) >= 0)
+        rays = rays._replace(face=ground, barycentrics=jnp.stack(shares), x=x, y=y, asked=goes_on)
+        return stored((looks + 1, rays, jnp.where(following >= 0, following, edge)))
+
+    def is_left(state: _Look) -> Array:
+        return (state[0] < _LOOKS) & jnp.any(state[1].asked)
+
     rays = Rays(
         face=dark.face,
         barycentrics=jnp.stack(dark.barycentrics),
@@ -228,22 +264,10 @@ def _edge_between(
         y=ends[0][1],
         key=zero,
         unit=zero,
-        asked=zero == 0,
+        asked=lamps.turned[lamp, dark.face],
     )
-    line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
-    nearby = faces_near(pictures, geometry, rays, line)
-    part, _, _ = _leaves(stored(seen(nearby.corners)), ends)
-    part = stored(jnp.where((nearby.cut.stops > 0) & (part < 2), part, -1))
-    farthest = jnp.max(part, axis=0)
-    nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
-    row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
-    face = jnp.where(lamps.turned[lamp, dark.face], picked(nearby.face, row), -1)
-
-    def corners_of(face: Array) -> Array:
-        return seen(face_corners(geometry, face))
-
-    face = _covering(face, farthest < 0, topology.neighbors, corners_of, ends[0])
-    return _follow(face, topology.neighbors, corners_of, ends)
+    start = jnp.sum(dark.face & 0), rays, jnp.full_like(dark.face, -1)
+    return lax.while_loop(is_left, look, start)[-1]
 
 
 def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"]) -> Array:
@@ -303,28 +327,31 @@ def _follow(
     neighbors: Int[Array, "F 3"],
     corners_of: Callable[[Array], Array],
     ends: list[list[Array]],
-) -> Int[Array, " n"]:
-    """The edge at which the surface ends, or turns away, on the way from a face."""
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """The edge at which the surface ends, or turns away, on the way from a face; and where, 0 to 1.
+
+    The edge is -1 where none is found.
+    """
 
     def step(state: _State) -> _State:
-        steps, face, edge, turn, found, done = state
+        steps, face, edge, end, turn, found, done = state
         part, corner, volume = _leaves(corners_of(face), ends)
         turned = (edge >= 0) & (volume * turn <= 0)
         found = found | (~done & ((face < 0) | turned) & (edge >= 0))
         done = done | found | (face < 0) | (part > 1)
         following = neighbors[jnp.maximum(face, 0), corner]
         next_edge = jnp.where(done, edge, 3 * face + corner)
-        turn = jnp.where(done, turn, jnp.sign(volume))
+        end, turn = jnp.where(done, jnp.stack([end, turn]), jnp.stack([part, jnp.sign(volume)]))
         face = jnp.where(done, face, following)
-        return stored((steps + 1, face, next_edge, turn, found, done))
+        return stored((steps + 1, face, next_edge, end, turn, found, done))
 
     def is_on_the_way(state: _State) -> Array:
         return (state[0] < _STEPS) & ~jnp.all(state[-1])
 
-    nothing = jnp.zeros_like(face)
-    start = jnp.sum(nothing), face, nothing - 1, jnp.zeros_like(ends[0][0]), face < -1, face < 0
-    _, _, edge, _, found, _ = lax.while_loop(is_on_the_way, in_strides(step), start)
-    return stored(jnp.where(found, _named_once(edge, neighbors), -1))
+    nothing, zero = jnp.zeros_like(face), jnp.zeros_like(ends[0][0])
+    start = jnp.sum(nothing), face, nothing - 1, zero, zero, face < -1, face < 0
+    _, _, edge, end, _, found, _ = lax.while_loop(is_on_the_way, in_strides(step), start)
+    return stored((jnp.where(found, _named_once(edge, neighbors), -1), end))
 
 
 def _named_once(edge: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, " n"]:
