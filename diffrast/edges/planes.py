@@ -11,7 +11,6 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored, stored_together
-from diffrast._topology import by_three
 
 TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
@@ -130,9 +129,3 @@ def area(corners: Array) -> Array:
     x, y = corners[:2] / jnp.where(before, corners[2], 1)
     twice = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     return jnp.where(before, abs(twice), jnp.inf)
-
-
-def on_edge(edge: Int[Array, " n"], s: Array) -> Columns:
-    """Barycentric coordinates a part `s` of the way along an edge from corner i to j, 3 i + j."""
-    start, end = by_three(edge)
-    return [jnp.where(start == j, 1 - s, jnp.where(end == j, s, 0)) for j in range(3)]

@@ -42,7 +42,6 @@ from diffrast.edges.planes import (
     edge_values,
     inverse_depth_slope,
     lowest,
-    on_edge,
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
 
@@ -138,13 +137,12 @@ def look(
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
     one pixel all round; `bare_blocks` are those of `blocks_with_background`.
     """
-    own, own_corners, weights, *ends, range_, fold, first_on_right = stored_together(
+    own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
             segments.faces[:, pieces.segment],
             segments.corners[:, pieces.segment],
             segments.weights[:, pieces.segment],
             *segments.ends[..., pieces.segment],
-            segments.range[:, pieces.segment],
             segments.fold[pieces.segment],
             segments.first_on_right[pieces.segment],
         )
@@ -166,7 +164,7 @@ def look(
     slopes = inverse_depth_slope(face_corners, volume[jnp.maximum(own, 0)], inward[:, None])
     use_first = (own[0] >= 0) & (~fold | (own[1] < 0) | (slopes[0] >= slopes[1]))
     front, other = jnp.where(use_first, own, own[::-1])
-    front_corners, other_corners = jnp.where(use_first, own_corners, own_corners[::-1])
+    front_corners = jnp.where(use_first, *own_corners)
     front_on_right = jnp.where(use_first | fold, first_on_right, ~first_on_right)
     outward = jnp.where(front_on_right, -1, 1)
     front, other, outward = stored_together((front, other, outward))
@@ -306,7 +304,11 @@ def look(
     gap = stops & is_bare_near(bare_blocks, *pieces.pixel)
     beyond = jnp.where(nearer_lies[0], reached[1], jnp.where(lies[1], reached[2], beyond))
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
-    at_beyond = barycentrics(edge_values(corners_of(beyond, faces, pixels), x[1], y[1])[0])
+    # On the edge itself rounding would decide whether a face that ends there shades it.
+    sides = jnp.stack([front, beyond])
+    x, y = (jnp.stack([along[3], along[1]]) for along in (x, y))
+    values, _ = edge_values(corners_of(sides, faces, pixels), x, y)
+    at_front, at_beyond = zip(*barycentrics([jnp.maximum(v, 0) for v in values]), strict=True)
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
@@ -316,10 +318,6 @@ def look(
     beyond_look = _where_shown(beyond, beyond_look, patch, topology.patches)
     beyond_look = stored(jnp.where(gap, bare_look, beyond_look))
 
-    s = t * weights[1] / jnp.where(near > 0, near, 1)
-    s = stored(range_[0] + s * (range_[1] - range_[0]))
-    on_other = on_edge(other_corners, s)
-    at_beyond = [jnp.where(fold, a, b) for a, b in zip(at_beyond, on_other, strict=True)]
     rim = look_inwards(
         front,
         thickness,
@@ -350,9 +348,9 @@ def look(
         visible=visible & ~flap,
         fold=fold,
         front_on_right=front_on_right,
-        front=Side(front, on_edge(front_corners, s), front_shown, is_front),
+        front=Side(front, list(at_front), front_shown, is_front),
         unseen=first_row(pictured == front) == 9,
-        beyond=Side(beyond, at_beyond, beyond_look, is_beyond & ~is_front),
+        beyond=Side(beyond, list(at_beyond), beyond_look, is_beyond & ~is_front),
         rim=rim,
         wrong_side=wrong_side,
         centre_depth=centre_depth,

@@ -247,8 +247,7 @@ def _edge_between(
         x, y = (a + end * (b - a) for a, b in zip(*way, strict=True))
         goes_on = following >= 0
         ground = _covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
-        values, volume = edge_functions(corners_of(ground), x, y)
-        shares = barycentrics(values)
+        shares = barycentrics(edge_functions(corners_of(ground), x, y)[0])
         goes_on = goes_on & (jnp.min(jnp.stack(shares), axis=0) >= 0)
         rays = rays._replace(face=ground, barycentrics=jnp.stack(shares), x=x, y=y, asked=goes_on)
         return stored((looks + 1, rays, jnp.where(following >= 0, following, edge)))
