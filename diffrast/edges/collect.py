@@ -222,7 +222,9 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
             rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
             pixel=jnp.stack([number % width, number // width % height]),
         )
-        outlines = cross_shadows(places, exists, cast, view.faces, pixels, view.face_image)
+        outlines = cross_shadows(
+            places, exists, cast, view.faces, view.topology.neighbors, pixels, view.face_image
+        )
 
         def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
             return with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))

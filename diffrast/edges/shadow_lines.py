@@ -153,6 +153,7 @@ def cross_shadows(
     exists: Bool[Array, " n"],
     cast: Cast,
     faces: Int[Array, "F 3"],
+    neighbors: Int[Array, "F 3"],
     pixels: Table,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Outlines:
@@ -165,7 +166,8 @@ def cross_shadows(
         x, y, w = pixels[:, vertex]
         return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
 
-    # The faces round the pixel, and those of its surface that are turned to the light.
+    # The faces round the pixel and beside its own, and those of its surface that are turned to the
+    # light.
     column, row = pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
     shown = stored(pixels_round(face_image, *pixel))
     seen = jnp.maximum(shown, 0)
@@ -181,8 +183,13 @@ def cross_shadows(
     looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
     first_is_lit = jnp.stack([picked(lit, k) for k in looks[0]])
     looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
-    which, received = _unlike(shown[_NEAREST], counts[_NEAREST], _FACES)
-    ground_face = jnp.stack([picked(shown[_NEAREST], k) for k in which])
+    joined = stored(neighbors[seen[4]].T)
+    joins = counts[4] & (joined >= 0) & cast.turned[light, jnp.maximum(joined, 0)]
+    joins = joins & (cast.patches[jnp.maximum(joined, 0)] == patch[4])
+    near = jnp.concatenate([shown[4:5], joined, shown[_NEAREST[1:]]])
+    falls = jnp.concatenate([counts[4:5], joins, counts[_NEAREST[1:]]])
+    which, received = _unlike(near, falls, _FACES)
+    ground_face = jnp.stack([picked(near, k) for k in which])
     is_own = received & (ground_face == own)
 
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3

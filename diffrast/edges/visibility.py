@@ -164,7 +164,7 @@ def look(
     slopes = inverse_depth_slope(face_corners, volume[jnp.maximum(own, 0)], inward[:, None])
     use_first = (own[0] >= 0) & (~fold | (own[1] < 0) | (slopes[0] >= slopes[1]))
     front, other = jnp.where(use_first, own, own[::-1])
-    front_corners = jnp.where(use_first, *own_corners)
+    front_corners = jnp.where(use_first, own_corners[0], own_corners[1])
     front_on_right = jnp.where(use_first | fold, first_on_right, ~first_on_right)
     outward = jnp.where(front_on_right, -1, 1)
     front, other, outward = stored_together((front, other, outward))
