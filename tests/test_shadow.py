@@ -1,114 +1,34 @@
 """Shadows: rays cast in float64, every scale and shading, degenerate input, no price unused."""
 
+import re
 from dataclasses import replace
 
-import box_filter
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
 import scenes
+from shadow_scenes import (
+    FRAME,
+    ROUND_THE_CORNER,
+    SCENES,
+    SIZE,
+    ball,
+    floor,
+    lamp,
+    make,
+    settings,
+    spot,
+    sun,
+)
 
 import diffrast as dr
 from diffrast import deferred, linalg, shapes
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
-SIZE = 96
-LIGHT = {"ambient": (0.1, 0.1, 0.2), "diffuse": (0.8, 0.8, 0.7)}
-FRAME = {"fov_y": 0.7, "aspect": 1.0, "near": 0.1, "far": 50.0}
-ROUND_THE_CORNER = dr.Camera.perspective(eye=(3, 3, 6), target=(0, 0, 0), **FRAME)
-
-
-def settings(**options):
-    return dr.RenderSettings(height=SIZE, width=SIZE, **{"antialias": False, **options})
-
-
-# ----------------------------------------------------------------------------------------- scenes
-
-
-def floor(mesh=None, height=-1.0):
-    down = linalg.compose(linalg.translation((0, height, 0)), linalg.rotation_x(-np.pi / 2))
-    return dr.Object(shapes.plane(8.0, 8.0) if mesh is None else mesh, transform=down)
-
-
-def sun(direction=(-0.8, -1.0, 0.3), **shadow):
-    return dr.DirectionalLight(direction=direction, shadow=dr.Shadow(**shadow), **LIGHT)
-
-
-def lamp(position, **shadow):
-    return dr.PointLight(position=position, shadow=dr.Shadow(**shadow), **LIGHT)
-
-
-def spot(**shadow):
-    place = {"position": (2, 3, 1.5), "direction": (-2, -3, -1.5), "cutoff": 0.6}
-    return dr.SpotLight(**place, shadow=dr.Shadow(**shadow), **LIGHT)
-
-
-def ball(subdivisions=3):
-    return dr.Object(shapes.icosphere(subdivisions))
-
-
-def sponge(level):
-    """A Menger sponge of cubes, without the faces that two of them have in common."""
-    cells = np.zeros((1, 3), int)
-    steps = np.array([i for i in np.ndindex(3, 3, 3) if sum(k == 1 for k in i) < 2])
-    for _ in range(level):
-        cells = (3 * cells[:, None] + steps).reshape(-1, 3)
-    filled = set(map(tuple, cells))
-    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    quads = []
-    for axis, side in np.ndindex(3, 2):
-        shift = np.eye(3, dtype=int)[axis] * (2 * side - 1)
-        corners = np.roll(np.insert(square, 0, side, axis=1), axis, axis=1)
-        bare = [cell for cell in cells if tuple(cell + shift) not in filled]
-        quads += [(cell + corners)[:: 2 * side - 1] for cell in bare]
-    vertices = 2 * np.concatenate(quads) / 3**level - 1
-    first = 4 * np.arange(len(quads))[:, None, None]
-    faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
-    return dr.Object(dr.Mesh(vertices=np.float32(vertices), faces=faces))
-
-
-def hills():
-    x, y = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40))
-    rough = np.random.default_rng(0).normal(size=x.shape).cumsum(axis=0) / 120
-    return shapes.height_field(0.15 * np.sin(5 * y + 1) * np.cos(4 * x) + rough, 4.0, 4.0)
-
-
-def cubes():
-    places = ((0, 0, 0.5), (1.5, 0.5, 0.3), (-1, 1.5, 0.4), (0.3, -1.8, 0.7))
-    for x, z, size in places:
-        moved = linalg.compose(linalg.translation((x, size - 1, z)), linalg.rotation_y(x + z))
-        yield dr.Object(shapes.cube(), None, moved @ linalg.scaling(size))
-
-
 WRONG = (0.0005, 0.002)  # share of the points seen: with 512 texels, with few
-TEAPOT_VIEW = dr.Camera.perspective(eye=(2, -8, 5), target=(0, 0, 1), up=(0, 0, 1), **FRAME)
-SCENES = {  # objects, light, camera
-    "ball": lambda: ([ball(), floor()], sun(resolution=128), ROUND_THE_CORNER),
-    "cubes in the light of a spot": lambda: ([*cubes(), floor()], spot(), ROUND_THE_CORNER),
-    "lamp in a sponge": lambda: (
-        [sponge(2), floor(shapes.plane(40.0, 40.0), -1.5)],
-        lamp((0.05, 0.1, -0.07)),
-        dr.Camera.perspective(eye=(3, 6, 9), target=(0, 0, 0), **FRAME),
-    ),
-    "hills in the evening": lambda: (
-        [floor(hills(), 0.0)],
-        sun((-1.0, -0.15, -0.3)),
-        dr.Camera.perspective(eye=(0, 3, 4), target=(0, 0, 0), **FRAME),
-    ),
-    "teapot": lambda: (
-        [dr.Object(shapes.teapot(6)), dr.Object(shapes.plane(12.0, 12.0))],
-        sun((-0.5, 0.6, -1.0)),
-        TEAPOT_VIEW,
-    ),
-}
-
-
-def make(name):
-    objects, light, camera = SCENES[name]()
-    return dr.Scene(objects=objects, lights=[light]), camera
 
 
 # ----------------------------------------------------------------------------------- the lit points
@@ -228,84 +148,6 @@ def test_a_light_that_is_not_seen_leaves_its_ambient_part():
     np.testing.assert_allclose(got, want, atol=2e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "error"), [("cubes in the light of a spot", 1.2e-4), ("hills in the evening", 1.5e-3)]
-)
-def test_pictures_with_outlines_equal_the_mean_over_pixels(name, error):
-    """Also where cubes touch the floor, to the last digits, and on faces turned from the light.
-
-    Without edges the errors are 2.7e-3 and 4.5e-3. On the hills the colour of rough ground turns
-    within a pixel, and outlines pass from face to face.
-    """
-    scene, camera = make(name)
-    picture = dr.render(scene, camera, settings(antialias=True))
-    oracle = scenes.Oracle(scene, camera.view, camera.projection)
-    want = box_filter.render_box(
-        oracle.positions,
-        oracle.normals,
-        oracle.faces,
-        oracle.view,
-        oracle.projection,
-        lights=[light | {"shadow": True} for light in oracle.lights],
-        material=oracle.material(),
-        background=np.zeros(3),
-        height=SIZE,
-        width=SIZE,
-        shading="phong",
-        lines=16,
-        piercing=True,
-    )
-    assert np.mean(np.abs(picture - want)) < error
-
-
-def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
-    """Picture and derivative by the light against many samples."""
-    size, step = 48, 0.01
-    turned = linalg.compose(linalg.translation((0, -0.2, 0)), linalg.rotation_y(0.5))
-    box = dr.Object(shapes.cube(), transform=turned @ linalg.scaling(0.5))
-    tiles = floor(shapes.plane(8.0, 8.0, divisions=5))
-    camera = dr.Camera.orthographic(
-        eye=(3, 3, 6), target=(0, -0.3, 0), up=(0, 1, 0), height=4.0, near=0.1, far=50.0
-    )
-
-    def picture(direction, **options):
-        scene = dr.Scene(objects=[box, tiles], lights=[sun(direction)])
-        options = dr.RenderSettings(height=size, width=size, shading="flat", **options)
-        return dr.render(scene, camera, options)
-
-    def many_samples(direction):
-        return np.asarray(picture(direction, antialias=False, samples=1024), float)
-
-    light, way = jnp.array([-0.65, -1, -0.15]), jnp.array([0.6, 0.2, -0.7])
-    got, change = jax.jit(lambda d, v: jax.jvp(picture, (d,), (v,)))(light, way)
-    want = many_samples(light)
-    assert np.mean(np.abs(got - want)) < 1e-4  # without edges .005
-    difference = (many_samples(light + step * way) - many_samples(light - step * way)) / (2 * step)
-    blurred = [
-        x.reshape(12, 4, 12, 4, 3).mean(axis=(1, 3)) for x in (np.asarray(change), difference)
-    ]
-    assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
-
-
-def test_pairs_of_pixels_without_an_outline_are_counted():
-    scene = dr.Scene(objects=[ball(2), floor()], lights=[sun(), sun((0.5, -1.0, 0.2))])
-    found = dr.shadow_outlines(scene, ROUND_THE_CORNER, settings())
-    assert found.edge.shape == (2, 2, SIZE, SIZE)
-    assert np.all(found.pairs > 30)
-    assert np.all(found.found <= found.pairs)
-    assert np.all(found.found >= 0.95 * found.pairs)
-    plain = replace(scene, lights=())
-    assert dr.shadow_outlines(plain, ROUND_THE_CORNER, settings()) is None
-
-
-@pytest.mark.parametrize("name", ["cubes in the light of a spot", "hills in the evening"])
-def test_nearly_all_outlines_are_found(name):
-    """The border of a spot's cone is none, nor is where a hill turns away from the light."""
-    found = dr.shadow_outlines(*make(name), settings())
-    assert found.pairs > 60
-    assert found.found >= 0.99 * found.pairs
-
-
 def test_batches_equal_single_views():
     scene, camera = make("ball")
     directions = jnp.array([[-0.8, -1.0, 0.3], [0.5, -1.0, -0.2]])
@@ -319,34 +161,26 @@ def test_batches_equal_single_views():
         np.testing.assert_array_equal(got, lit(direction))
 
 
-def test_rims_thinner_than_a_texel_have_outlines():
-    """The light sees the faces at a smooth ring's rim edge-on: none of the texels shows them."""
-    place = dr.linalg.compose(
-        dr.linalg.translation((0.3, 0.2, 0.9)), dr.linalg.rotation((1, 0.3, 0.2), 0.5)
-    )
-    ring, floor = dr.shapes.torus(0.6, 0.2), dr.shapes.plane(12.0, 12.0)
-    light = dr.DirectionalLight(direction=(-0.5, 0.3, -1), shadow=dr.Shadow(resolution=256))
-    scene = dr.Scene(objects=[dr.Object(ring, transform=place), dr.Object(floor)], lights=[light])
-    camera = dr.Camera.perspective(
-        eye=(0.3, -3.2, 3), target=(0, 0.1, 0.4), up=(0, 0, 1), fov_y=0.8, near=0.5, far=30
-    )
-    found = dr.shadow_outlines(scene, camera, dr.RenderSettings(height=128, width=128))
-    assert found.pairs[0] > 150
-    assert found.found[0] >= 0.97 * found.pairs[0]
-
-
 # --------------------------------------------------------------------------------- degenerate input
 
 
-@pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types:FutureWarning")
-def test_outlines_are_found_in_float64_too():
+def of_precision(tree, dtype):
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else x.dtype), tree)
+
+
+@pytest.mark.parametrize("bits", [32, 64])
+def test_pictures_keep_the_precision_of_their_scene(bits):
+    """Also that of 32 bits where 64 are enabled: a constant may ask for more, as may an integer."""
     with jax.enable_x64(True):
-        body = dr.shapes.cube()
-        scene = dr.Scene(objects=[dr.Object(body)], lights=[sun(), lamp((1.0, 2.0, 3.0))])
+        scene = dr.Scene(objects=[ball(1)], lights=[sun(), lamp((1.0, 2.0, 3.0))])
         camera = dr.Camera.perspective(eye=(0, 1, 5), target=(0, 0, 0), fov_y=0.7, near=1, far=9)
+        arguments = of_precision((scene, camera), f"float{bits}")
         options = dr.RenderSettings(height=8, width=8)
-        image = jax.eval_shape(lambda scene: dr.render(scene, camera, options), scene)
-        assert image.dtype == jnp.float64
+        gradient = jax.grad(lambda *of: dr.render(*of, options).sum(), (0, 1), allow_int=True)
+        program = jax.make_jaxpr(gradient)(*arguments)
+    assert program.out_avals[0].dtype == f"float{bits}"
+    if bits == 32:
+        assert not re.findall(r"f64\[\d", str(program))
 
 
 @pytest.fixture(scope="module")
@@ -455,22 +289,6 @@ def test_errors_name_the_argument(make, message):
         make()
 
 
-def test_neither_of_two_bodies_shades_the_line_where_it_pierces_the_other():
-    """Both are lit in front of it: nothing in view is dark, at any sample of the line."""
-    dull = dr.Material(diffuse=(1.0, 1.0, 1.0))
-    sunk = dr.linalg.translation((0.13, 0.0, 0.91))
-    scene = dr.Scene(
-        objects=[dr.Object(dr.shapes.plane(8, 8), dull), dr.Object(dr.shapes.cube(), dull, sunk)],
-        lights=[dr.DirectionalLight(direction=(0, 0.6, -0.8), shadow=dr.Shadow(resolution=128))],
-        background=(1, 1, 1),
-    )
-    camera = dr.Camera.perspective(
-        eye=(0.3, -6, 3), target=(0, -1, 0), up=(0, 0, 1), fov_y=0.4, near=0.5, far=20
-    )
-    image = dr.render(scene, camera, dr.RenderSettings(height=64, width=64))
-    assert float(image.min()) > 0.59  # the cube's front, the least lit
-
-
 @pytest.mark.parametrize("very_large", [False, True])
 def test_large_pictures_are_shaded_as_small_ones(monkeypatch, very_large):
     """Of the points that shadows fall on, or in batches which find these again."""
@@ -482,31 +300,3 @@ def test_large_pictures_are_shaded_as_small_ones(monkeypatch, very_large):
         monkeypatch.setattr(deferred, "VERY_LARGE", 0)
     large = jax.jit(lambda *arguments: dr.render.__wrapped__(*arguments))(*arguments)
     np.testing.assert_allclose(large, small, atol=1e-6)
-
-
-def test_outlines_of_several_shadows_end_at_each_other():
-    """Of three bars behind the camera; also at their corners."""
-    turns = ((0.4, 3.0, 0.25), (1.3, 3.4, 0.3), (2.3, 3.8, 0.2))
-    bars = [
-        dr.Object(
-            shapes.cube(),
-            transform=linalg.compose(
-                linalg.translation((0, height, 0)),
-                linalg.rotation_y(turn),
-                linalg.scaling((1.5, 0.03, width)),
-            ),
-        )
-        for turn, height, width in turns
-    ]
-    floor_ = dr.Object(shapes.plane(40.0, 40.0), transform=linalg.rotation_x(-np.pi / 2))
-    camera = dr.Camera.perspective(
-        eye=(2.7, 2, -1.3), target=(2.6, 0, -1.5), up=(0, 0, -1), fov_y=1.3, near=0.1, far=50
-    )
-    scene = dr.Scene(objects=[floor_, *bars], lights=[sun((0.8, -1, -0.45))])
-
-    def picture(**options):
-        options = dr.RenderSettings(height=48, width=48, shading="flat", **options)
-        return np.float64(dr.render(scene, camera, options))
-
-    want = picture(antialias=False, samples=256)
-    assert np.mean(np.abs(picture() - want)) < 3e-4  # of 16 samples 1.1e-3

@@ -22,7 +22,7 @@ from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked, walk
 from diffrast.edges.pieces import facing, to_pixels
-from diffrast.edges.planes import Table, barycentrics, edge_functions, lowest
+from diffrast.edges.planes import Table, barycentrics, edge_functions, largest, lowest
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.shadows.cast import Shadows, by_resolution, shone_on
@@ -32,6 +32,7 @@ from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
 _STEPS = 64  # from face to face
+_EDGE_ON = 8  # roundings in the volume of a face
 _LOOKS = 8  # from one outline to the next
 _BEYOND = 1 / 64  # of the way from an outline to what is lit: where the next one is looked for
 
@@ -232,8 +233,9 @@ def _edge_between(
         way = [[rays.x, rays.y], ends[1]]
         line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
         nearby = faces_near(pictures, geometry, rays, line)
-        part, _, _ = _leaves(stored(seen(nearby.corners)), way)
-        part = stored(jnp.where((nearby.cut.stops > 0) & (part < 2), part, -1))
+        part, _, volume = _leaves(stored(seen(nearby.corners)), way)
+        part = jnp.where((nearby.cut.stops > 0) & (volume != 0) & (part < 2), part, -1)
+        part = stored(part)
         farthest = jnp.max(part, axis=0)
         nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
         row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
@@ -281,9 +283,14 @@ def _leaves(
     """Where on the way between two points, 0 to 1, a face ends; 3 if it does not.
 
     Also the corner opposite to the edge there, and the volume of the face, whose sign tells which
-    side it turns to the light.
+    side it turns to the light; zero if the light sees it edge-on, as far as rounding can tell.
     """
     (first, volume), (last, _) = (edge_functions(corners, *end) for end in ends)
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    extent = jnp.maximum(largest(one), largest(other))
+    place = jnp.max(jnp.abs(corners), axis=1)
+    size = jnp.maximum(place[0], place[1]) * place[2] * extent
+    volume = jnp.where(abs(volume) > _EDGE_ON * jnp.finfo(size.dtype).eps * size, volume, 0)
     sign = jnp.where(volume < 0, -1, 1)
     parts = []
     for a, b in zip(first, last, strict=True):
