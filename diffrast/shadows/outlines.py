@@ -3,7 +3,8 @@
 Of two neighbouring pixels that show one surface one may be lit and the other hidden from the light
 by a face. Seen by the light, a straight line leads from the hidden point to the lit one: it is
 followed from that face to the next across their common edge, to where the surface ends or turns
-away from the light. This edge has the outline of the shadow that passes between the two pixels,
+away from the light. Where something else hides the light just beyond, that is followed on, until
+nothing does. The last edge has the outline of the shadow that passes between the two pixels,
 whatever the size of faces and texels. Indices only: no derivatives.
 """
 
