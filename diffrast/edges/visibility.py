@@ -308,7 +308,7 @@ def look(
     sides = jnp.stack([front, beyond])
     x, y = (jnp.stack([along[3], along[1]]) for along in (x, y))
     values, _ = edge_values(corners_of(sides, faces, pixels), x, y)
-    at_front, at_beyond = zip(*barycentrics([jnp.maximum(v, 0) for v in values]), strict=True)
+    beside = barycentrics([jnp.maximum(value, 0) for value in values])
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
@@ -348,9 +348,9 @@ def look(
         visible=visible & ~flap,
         fold=fold,
         front_on_right=front_on_right,
-        front=Side(front, list(at_front), front_shown, is_front),
+        front=Side(front, [b[0] for b in beside], front_shown, is_front),
         unseen=first_row(pictured == front) == 9,
-        beyond=Side(beyond, list(at_beyond), beyond_look, is_beyond & ~is_front),
+        beyond=Side(beyond, [b[1] for b in beside], beyond_look, is_beyond & ~is_front),
         rim=rim,
         wrong_side=wrong_side,
         centre_depth=centre_depth,
