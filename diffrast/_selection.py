@@ -9,10 +9,11 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
-from diffrast._device import draws_on_cpu
+from diffrast._device import anywhere, draws_on_cpu, in_strides
 from diffrast._stored import stored, zero_after
 
 S = TypeVar("S")
@@ -21,6 +22,7 @@ T = TypeVar("T")
 _BLOCK = 16
 _BLOCKS_AT_ONCE = 64
 _ROW = 64
+_TRIANGLE = np.triu(np.ones((_ROW, _ROW), np.float32))
 
 
 def prefix_sum(counts: Int[Array, " n"]) -> Int[Array, " n"]:
@@ -32,8 +34,7 @@ def prefix_sum(counts: Int[Array, " n"]) -> Int[Array, " n"]:
     size = counts.shape[0]
     rows = -(-size // _ROW)
     table = jnp.pad(counts, (0, rows * _ROW - size)).reshape(rows, _ROW).astype(jnp.float32)
-    triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
-    within = jnp.matmul(table, triangle, precision=lax.Precision.HIGHEST).astype(jnp.int32)
+    within = jnp.matmul(table, _TRIANGLE, precision=lax.Precision.HIGHEST).astype(jnp.int32)
     totals = within[:, -1]
     if rows <= 8 * _ROW:
         earlier = jnp.arange(rows)[:, None] > jnp.arange(rows)
@@ -97,7 +98,8 @@ def over_batches(
 ) -> T:
     """Fold `add(indices, exists, total)` over the first `count` of `order`, so many at a time.
 
-    From the batch `first` on, and only while `goes_on(total)`.
+    From the batch `first` on, and only while `goes_on(total)`. Of several views that are drawn side
+    by side the last batches may be of nothing that exists.
     """
     batches = batches_of(count, at_once)
 
@@ -109,7 +111,7 @@ def over_batches(
 
     def is_left(state: tuple[Array, T]) -> Array:
         left = state[0] < batches
-        return left if goes_on is None else left & goes_on(state[1])
+        return anywhere(left) if goes_on is None else left & goes_on(state[1])
 
     return lax.while_loop(is_left, step, (jnp.asarray(first), start))[1]
 
@@ -123,15 +125,17 @@ def work_off(
 ) -> T:
     """Work through `count` pieces of work that take unequal numbers of steps, so many at a time.
 
-    A piece that has ended makes room for the next at once.
+    A piece that has ended makes room for the next at once, or after some steps.
 
     Args:
         count: of pieces.
         at_once: pieces side by side.
         begin: makes what is known of pieces at first of their numbers.
         step: takes what is known of pieces, which of them go on, and the total; returns the same.
+            It changes nothing of others.
         start: the total before.
     """
+    go = in_strides(lambda state: step(*state))
 
     def advance(state: tuple[Array, Array, S, T]) -> tuple[Array, Array, S, T]:
         following, goes, known, total = state
@@ -139,11 +143,11 @@ def work_off(
         number = following + rank - 1
         fresh = stored(~goes & (number < count))
         known = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begin(number), known)
-        known, goes, total = step(stored(known), goes | fresh, total)
+        known, goes, total = go((stored(known), goes | fresh, total))
         return following + rank[-1], goes, stored(known), total
 
     def is_left(state: tuple[Array, Array, S, T]) -> Array:
-        return (state[0] < count) | jnp.any(state[1])
+        return anywhere((state[0] < count) | jnp.any(state[1]))
 
     none = jnp.zeros(at_once, jnp.int32) + (count & 0)
     return lax.while_loop(is_left, advance, (count & 0, none < 0, begin(none), start))[-1]

@@ -77,7 +77,7 @@ def find_turning(
         return mean, bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
 
     seen = lax.stop_gradient((face_image, hard))
-    return Turning(*seen, *over_views(lambda _: find, face_image.size)(*seen))
+    return Turning(*seen, *over_views(find, face_image.size)(*seen))
 
 
 def bending(turning: Turning, image: Float[Array, "height width 3"]) -> Chosen:
@@ -135,6 +135,7 @@ def _largest(values: Array, least: Array, last: Array) -> Chosen:
     places = _places(values)
     blocks = jnp.pad(values, ((0, -height % _BLOCK), (0, 0))).reshape(-1, _BLOCK, width)
     blocks = jnp.max(blocks, axis=1).reshape(-1)
+    some = at_once(_BLOCKS_AT_ONCE, blocks.size)
 
     def are_few(found: _Lists) -> Array:
         return found[2] + found[3] <= places
@@ -158,10 +159,10 @@ def _largest(values: Array, least: Array, last: Array) -> Chosen:
 
         zero = zero_after(size)
         start = jnp.zeros_like(ahead), jnp.zeros_like(behind), zero, zero
-        return 2 * least, over_batches(order, size, _BLOCKS_AT_ONCE, add, start, goes_on=are_few)
+        return 2 * least, over_batches(order, size, some, add, start, goes_on=are_few)
 
     zero = zero_after(blocks[0]).astype(jnp.int32)
-    room = jnp.zeros(places + _BLOCK * _BLOCKS_AT_ONCE, jnp.int32) + zero
+    room = jnp.zeros(places + _BLOCK * some, jnp.int32) + zero
     start = least, (room, room, zero + places + 1, zero)
     _, found = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
     ahead, behind, before, after = found

@@ -17,7 +17,7 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Bool, Float, Int
 
-from diffrast._device import at_once, over_views
+from diffrast._device import anywhere, at_once, most, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of, compacted, over_batches
 from diffrast._stored import stored, stored_together
@@ -123,7 +123,7 @@ def with_turns(
 
     seen = lax.stop_gradient((image, reached, drawn.positions_clip))
     surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart
-    points = over_views(lambda _: find, height * width)(turning, *seen, *surface)
+    points = over_views(find, height * width)(turning, *seen, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     number, _, total = points.chosen
     place = jnp.arange(number.size)
@@ -144,7 +144,7 @@ def _parts(chosen: Chosen, n: Array, count: Array) -> _Parts:
 
 
 def _over_parts(chosen: Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any) -> Any:
-    return lax.fori_loop(0, batches_of(count, chosen.at_once), step, start)
+    return lax.fori_loop(0, batches_of(most(count), chosen.at_once), step, start)
 
 
 def _faces_at(
@@ -190,7 +190,7 @@ def _faces_at(
 
     nowhere = jnp.full((_POINTS.shape[1], chosen.number.size), -1, jnp.int32)
     nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart))
-    return lax.cond(count > 0, find, lambda nowhere: nowhere, nowhere)
+    return lax.cond(anywhere(count > 0), find, lambda nowhere: nowhere, nowhere)
 
 
 def _unhidden(
@@ -248,7 +248,7 @@ def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array,
     """By how much the mean colours of pixels differ from those at their centres."""
 
     def over(function: Callable[..., Any]) -> Callable[..., Any]:
-        return over_views(lambda _: function, size[0] * size[1])
+        return over_views(function, size[0] * size[1])
 
     @jax.custom_jvp
     def added(inputs: _Inputs) -> Array:

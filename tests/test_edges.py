@@ -269,7 +269,7 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
 
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
-    sizes = AtOnce(edges=64, cut=1024, pieces=512, parts=16)
+    sizes = AtOnce(edges=64, cut=1024, pieces=512, few=32, parts=16)
     monkeypatch.setattr("diffrast.edges.collect.usual_batches", lambda *_: sizes)
     monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))
@@ -291,7 +291,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
 
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
-        method = Method(None, None, False, capacity, lanes=1)
+        method = Method(None, None, False, capacity)
         records, sums = collect(view, method)
         found = view._replace(unseen=sums.unseen)
 
@@ -316,10 +316,13 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
-def test_few_pieces_are_looked_at_in_parts():
+@pytest.mark.parametrize("many_views", [False, True])
+def test_few_pieces_are_looked_at_in_parts(many_views, monkeypatch):
     """Which follow each other to the bit, as pieces have to that add up to an outline's area."""
+    monkeypatch.setattr("diffrast.edges.pieces.views_fill_lanes", lambda: many_views)
     ranges = np.float32([[0.1, 0.25, 0.7], [0.2, 0.6, 0.75]])
-    at_once = usual_batches(100, 100, 1)
+    at_once = usual_batches(100, 100)
+    assert at_once.few * at_once.parts <= at_once.pieces
     number = jnp.arange(at_once.pieces + at_once.cut)
     places = jnp.minimum(number, 2)
     pieces = Pieces(places, jnp.stack([number, number]), jnp.asarray(ranges)[:, places], number < 0)

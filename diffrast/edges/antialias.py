@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
-from diffrast._device import lanes
+from diffrast._device import over_views
 from diffrast._linear import linear_zeros
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
-from diffrast.edges.collect import collect, each_view
+from diffrast.edges.collect import collect
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -147,7 +147,7 @@ def antialias_image(
     """
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 8 / ROWS_AT_ONCE))
-    method = Method(shader, glow, cull_backfaces, capacity, lanes())
+    method = Method(shader, glow, cull_backfaces, capacity)
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
     if view.topology.bodies is None and view.cast is None:
@@ -161,7 +161,7 @@ def antialias_image(
     view = view._replace(positions_clip=positions_clip, scale=scale)
 
     def gather(view: View, method: Method) -> Blended:
-        found: Blended = each_view(collect, method, height * width)(view)
+        found: Blended = over_views(lambda view: collect(view, method), height * width)(view)
         return found
 
     def with_edges(image: Array, sums: Sums | None) -> Array:

@@ -64,14 +64,12 @@ class Method(NamedTuple):
         glow: what one light adds to the colours, `glow(scene, light, face, barycentrics)`.
         cull_backfaces: whether only front faces are drawn.
         capacity: rows of the records; 0 for a picture alone, of which nothing is recorded.
-        lanes: how many times as many of each list are worked off at once as on a CPU.
     """
 
     shader: Shader | None
     glow: Glow | None
     cull_backfaces: bool
     capacity: int
-    lanes: int
 
 
 class Sums(NamedTuple):
@@ -303,15 +301,14 @@ def _with_values(
     held: Sequence[Float[Array, "channels n"]],
 ) -> tuple[Sums | None, Int[Array, " n"]]:
     """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
-    number = stored(jnp.where(used, _number(view, pixel), 0))
+    number = stored(jnp.where(used, _number(view, pixel), view.face_image.size))
     if total is None:
         return None, number
-    added = total.added.at[number].add(stored(jnp.where(used, value, 0)).T)
-    least = stored(jnp.where(used, reduce(jnp.minimum, held), jnp.inf))
-    greatest = stored(jnp.where(used, reduce(jnp.maximum, held), -jnp.inf))
+    added = total.added.at[number].add(stored(value).T, mode="drop")
     low, high = total.range
-    range_ = low.at[number].min(least.T), high.at[number].max(greatest.T)
-    return total._replace(added=added, range=range_), number
+    low = low.at[number].min(stored(reduce(jnp.minimum, held)).T, mode="drop")
+    high = high.at[number].max(stored(reduce(jnp.maximum, held)).T, mode="drop")
+    return total._replace(added=added, range=(low, high)), number
 
 
 def _along(

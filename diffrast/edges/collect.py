@@ -5,13 +5,13 @@ a batch is under `jax.jit`, which traces it once.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
-from diffrast._device import over_views
+from diffrast._device import anywhere, lanes
 from diffrast._selection import batches_of, over_batches, prefix_sum
 from diffrast._stored import stored, zero_after
 from diffrast.edges.blend import (
@@ -64,16 +64,6 @@ class Work(NamedTuple):
     add: Add
 
 
-def each_view(function: Callable[..., Any], method: Method, pixels: int) -> Callable[..., Any]:
-    """`function(view, method, ...)` without the method: of views under `vmap`, see `over_views`."""
-
-    def in_lanes(lanes: int) -> Callable[..., Any]:
-        own = method._replace(lanes=lanes)
-        return lambda view, *rest: function(view, own, *rest)
-
-    return over_views(in_lanes, pixels)
-
-
 def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     """Find the visible pieces, and the sum of what they add to the image.
 
@@ -103,7 +93,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
 
         def add_batch(indices: Array, exists: Array, total: Blended) -> Blended:
             records, sums = add(indices, exists, total)
-            return Blended(records and after_batch(records), sums)
+            return Blended(records and after_batch(records, exists[0]), sums)
 
         first = 0 if start is None else jnp.maximum(start.batch - passed, 0)
         blended = over_batches(
@@ -135,7 +125,7 @@ def _edges(
     order, count = choose_edges(edges, volume, view.apart)
     z = stored(view.positions_clip[:, 2])
     bare_blocks = blocks_with_background(view.face_image)
-    at_once = usual_batches(view.apart.size, height * width, method.lanes)
+    at_once = usual_batches(view.apart.size, height * width)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = clip_edges(
@@ -172,7 +162,7 @@ def _edges(
 
         def is_left(state: tuple[Array, Waiting, Blended]) -> Array:
             left = (state[0] < cuts) | (state[1].total > 0)
-            return left if goes_on is None else left & goes_on(state[2])
+            return anywhere(left) if goes_on is None else left & goes_on(state[2])
 
         start = ends[-1] & 0, none_waiting(segments, at_once.cut + at_once.pieces), total
         return lax.while_loop(is_left, add_pieces, start)[2]
@@ -185,7 +175,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
     order, count = choose_pixels(view.face_image, bodies, unseen)
-    lines_at_once = method.lanes * LINES_AT_ONCE
+    lines_at_once = lanes() * LINES_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         pixel = stored(jnp.stack([number % width, number // width]))
@@ -205,14 +195,14 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
 
         return over_batches(crossings.pairs, crossings.total, lines_at_once, add_lines, total)
 
-    return Work(order, count, method.lanes * PIXELS_AT_ONCE, add_pixels)
+    return Work(order, count, lanes() * PIXELS_AT_ONCE, add_pixels)
 
 
 def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
     """The outlines of shadows."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     order, count = choose_shadowed(cast)
-    shadows_at_once = method.lanes * SHADOWS_AT_ONCE
+    shadows_at_once = lanes() * SHADOWS_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         light = number // (width * height)
@@ -231,4 +221,4 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
 
         return over_batches(outlines.lines, outlines.total, shadows_at_once, add_lines, total)
 
-    return Work(order, count, method.lanes * SHADOWED_AT_ONCE, add_pixels)
+    return Work(order, count, lanes() * SHADOWED_AT_ONCE, add_pixels)

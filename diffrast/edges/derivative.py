@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from diffrast._device import at_once, most, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of
 from diffrast._stored import stored
 from diffrast.edges.blend import Method, View, cropped
-from diffrast.edges.collect import collect, each_view
+from diffrast.edges.collect import collect
 from diffrast.edges.records import Records, Start
 
 ROWS_AT_ONCE = 1024
@@ -23,7 +24,6 @@ ROWS_AT_ONCE = 1024
 
 def _over_rows(
     records: Records,
-    at_once: int,
     add: Callable[[Array, Any, Any], Any],
     start: Any,
     applies: Array | bool = True,
@@ -33,19 +33,19 @@ def _over_rows(
     Where it does not apply no row does: of a condition the branches would copy what they add to.
     """
     capacity = records.jump.shape[0]
-    at_once = min(at_once, capacity)
+    some = at_once(ROWS_AT_ONCE, capacity)
     count = jnp.where(applies, jnp.minimum(records.total - records.row, capacity), 0)
 
     def step(n: Array, total: Any) -> Any:
-        first = begin = n * at_once
-        if capacity % at_once:  # the last block begins among the rows of the one before
-            begin = jnp.minimum(first, capacity - at_once)
-        number = begin + jnp.arange(at_once)
+        first = begin = n * some
+        if capacity % some:  # the last block begins among the rows of the one before
+            begin = jnp.minimum(first, capacity - some)
+        number = begin + jnp.arange(some)
         used = number < count if begin is first else (number >= first) & (number < count)
-        rows = [lax.dynamic_slice_in_dim(column, begin, at_once) for column in records.columns]
+        rows = [lax.dynamic_slice_in_dim(column, begin, some) for column in records.columns]
         return add(used, rows, total)
 
-    return lax.fori_loop(0, batches_of(count, at_once), step, start)
+    return lax.fori_loop(0, batches_of(most(count), some), step, start)
 
 
 def _over_pieces(
@@ -59,14 +59,13 @@ def _over_pieces(
 
     The pieces that are not recorded are found again, as many at a time as there are rows.
     """
-    at_once = method.lanes * ROWS_AT_ONCE
 
     def step(state: tuple[Array, Start, Any]) -> tuple[Array, Start, Any]:
         which, start, total = state
         found = collect(view, method, start).records
         assert found is not None
         for n, add in enumerate(adds):
-            total = _over_rows(found, at_once, add, total, which == n)
+            total = _over_rows(found, add, total, which == n)
         ended = found.following.row >= records.total
         following = jax.tree.map(
             lambda again, next: jnp.where(ended, again, next), records.following, found.following
@@ -76,10 +75,10 @@ def _over_pieces(
     def is_left(state: tuple[Array, Start, Any]) -> Array:
         return state[0] < len(adds)
 
-    total = _over_rows(records, at_once, adds[0], total)
+    total = _over_rows(records, adds[0], total)
     which = jnp.where(records.following.row < records.total, 0, len(adds))
     total = lax.while_loop(is_left, step, (which, records.following, total))[2]
-    return _over_rows(records, at_once, adds[1], total) if len(adds) > 1 else total
+    return _over_rows(records, adds[1], total) if len(adds) > 1 else total
 
 
 def _push(
@@ -160,7 +159,11 @@ def apply_linear(
     view: View, method: Method, records: Records, rims: Array, points: Array, colors: Array
 ) -> Array:
     """`_push`, of which JAX knows both directions."""
-    push, pull = (each_view(way, method, rims.size) for way in (_push, _pull))
+
+    def each_view(way: Callable[..., Any]) -> Callable[..., Any]:
+        return over_views(lambda view, *rest: way(view, method, *rest), rims.size)
+
+    push, pull = each_view(_push), each_view(_pull)
     return linear_map(
         lambda changes, nothing: push(view, records, rims, *changes, nothing),
         lambda cotangent: pull(view, records, rims, cotangent),

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._device import at_once, in_strides
+from diffrast._device import anywhere, at_once, in_strides, views_fill_lanes
 from diffrast._selection import compacted, over_batches
 from diffrast._stored import stored, stored_together
 from diffrast._topology import by_three
@@ -15,6 +15,7 @@ from diffrast.edges.planes import Table, corners_of, covers, edge_values
 
 _STEPS = 40
 _WAYS_AT_ONCE = 512
+_MOST = 4  # of so many, mostly one
 _BLOCK = 4  # pixels
 
 
@@ -123,7 +124,7 @@ def walk(
 
         def is_on_the_way(state: tuple[Array, Array, Array]) -> Array:
             steps, _, there = state
-            return (steps < _STEPS) & ~jnp.all(there)
+            return anywhere((steps < _STEPS) & ~jnp.all(there))
 
         _, end, there = lax.while_loop(
             is_on_the_way, in_strides(step), (start[0] & 0, start, ~exists)
@@ -133,6 +134,6 @@ def walk(
         return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
 
     nowhere = jnp.minimum(face, -1), face < 0
-    some = at_once(_WAYS_AT_ONCE, face.size)
+    some = -(-face.size // _MOST) if views_fill_lanes() else at_once(_WAYS_AT_ONCE, face.size)
     ends, arrived = over_batches(order, count, some, go, nowhere)
     return ends.reshape(shape), arrived.reshape(shape)

@@ -19,12 +19,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import lanes, views_fill_lanes
 from diffrast._selection import compacted, prefix_sum, selected
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Edges, by_three
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
 
 PIECES_AT_ONCE = 256, 512
+OF_MANY_VIEWS = 128  # where others would wait for the view that has most
 FEW = 32  # pieces, each of which is looked at in parts
 _EDGE_ON = 8  # roundings in the volume of a face
 
@@ -32,12 +34,13 @@ _EDGE_ON = 8  # roundings in the volume of a face
 class AtOnce(NamedTuple):
     """How many edges are clipped at once, how many pieces cut, and how many looked at.
 
-    Where no more than `FEW` pieces are left they are looked at in so many parts each.
+    Where no more than a few pieces are left they are looked at in so many parts each.
     """
 
     edges: int
     cut: int
     pieces: int
+    few: int
     parts: int
 
 
@@ -64,17 +67,18 @@ class Pieces(NamedTuple):
     exists: Bool[Array, " n"]
 
 
-def usual_batches(edges: int, pixels: int, lanes: int) -> AtOnce:
+def usual_batches(edges: int, pixels: int) -> AtOnce:
     """Batches of a mesh of so many edges, neither mostly empty nor more than the caches hold.
 
     An outline has about the square root of the mesh's edges, and is cut at as many borders of
-    pixels. With `lanes` there is room for so many times as much.
+    pixels.
     """
     usual = 1 << round(math.log2(math.sqrt(edges) + math.sqrt(pixels)))
     least, most = PIECES_AT_ONCE
-    usual = min(max(usual, least), most)
-    pieces = lanes * usual
-    return AtOnce(8 * pieces, 2 * pieces, pieces, usual // FEW)
+    parts = min(max(usual, least), most) // FEW
+    usual = min(max(usual, OF_MANY_VIEWS if views_fill_lanes() else least), most)
+    pieces = lanes() * usual
+    return AtOnce(8 * pieces, 2 * pieces, pieces, usual // parts, parts)
 
 
 def to_pixels(positions_clip: Float[Array, "V 4"], height: int, width: int) -> Table:
@@ -256,11 +260,12 @@ def cut(
 ) -> Pieces:
     """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their counts."""
     number = first_piece + jnp.arange(at_once)
-    # As many segments end before or at each piece's number.
-    ended = jnp.zeros(at_once, jnp.int32).at[jnp.maximum(ends - first_piece, 0)]
-    segment = prefix_sum(ended.add(1, mode="drop"))
-    exists = segment < ends.shape[0]
-    segment = stored(jnp.minimum(segment, ends.shape[0] - 1))
+    # As many segments end before or at each piece's number. Those at the very end do not count:
+    # they may be many, and a GPU would take them one after another.
+    end = jnp.where(ends < ends[-1], jnp.maximum(ends - first_piece, 0), at_once)
+    ended = jnp.zeros(at_once, jnp.int32).at[end].add(1, mode="drop")
+    segment = stored(prefix_sum(ended))
+    exists = number < ends[-1]
     k = number - (ends - segments.parts)[segment]
     at = stored(segments.ends[..., segment])
     first, length = stored(_forward(at))
@@ -314,7 +319,7 @@ def first_ones(waiting: Waiting, at_once: AtOnce) -> Pieces:
 
     What hides a piece here and there is found one part after the other.
     """
-    parts = jnp.where(waiting.total <= FEW, at_once.parts, 1)
+    parts = jnp.where(waiting.total <= at_once.few, at_once.parts, 1)
     number = jnp.arange(at_once.pieces)
     piece, part = number // parts, number % parts
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))

@@ -23,6 +23,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import anywhere
 from diffrast._selection import selected
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology
@@ -243,7 +244,7 @@ def _meeting(
         return n + 1, *stored_together((reached, searched, now, met, following))
 
     def is_left(state: _Search) -> Array:
-        return (state[0] < _WALKS) & jnp.any(state[2])
+        return anywhere((state[0] < _WALKS) & jnp.any(state[2]))
 
     point = meet(planes)
     goes_on = jnp.any(topology.neighbors[jnp.maximum(pair, 0)] >= 0, axis=(0, 2))

@@ -62,10 +62,10 @@ def has_room(records: Records) -> Bool[Array, ""]:
     return records.total < records.following.row
 
 
-def after_batch(records: Records) -> Records:
-    """The same with one more batch worked off; in the first that is not recorded the next begin."""
-    batch = records.batch + 1
-    fits = has_room(records)
+def after_batch(records: Records, exists: Bool[Array, ""]) -> Records:
+    """The same after a batch, if it exists: in the first that is not recorded the next begin."""
+    batch = records.batch + exists
+    fits = exists & has_room(records)
     following = Start(
         records.following.row,
         jnp.where(fits, batch, records.following.batch),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from diffrast._device import over_views
 from diffrast._stored import stored
 from diffrast._topology import Edges
 from diffrast.geometry import Geometry, Points, positions_at
@@ -168,7 +169,7 @@ def _reached(
             first += sides(casting[i])
         together = zip(*parts, strict=True)
         rays = Rays(*(jnp.concatenate(column, axis=-1) for column in together))
-        bright = lit(pictures, geometry, shadows.neighbors, rays).reshape(len(members), *shape)
-        reached.update(zip(members, bright, strict=True))
+        own_lit = over_views(lit, face.size)(pictures, geometry, shadows.neighbors, rays)
+        reached.update(zip(members, own_lit.reshape(len(members), *shape), strict=True))
     numbers = iter(range(len(casting)))
     return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)

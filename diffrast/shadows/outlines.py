@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int, Shaped
 
-from diffrast._device import in_strides, lanes
+from diffrast._device import anywhere, in_strides, lanes, over_views
 from diffrast._selection import over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
@@ -96,8 +96,8 @@ def outlines(
                 cube=np.array(counts) > 1,
                 turned=jnp.stack([shadows.turned[i] for i in members]),
             )
-            own_lit = lit[np.array(members)]
-            edges = _between_pixels(lamps, pictures, geometry, topology, points, own_lit)
+            between = over_views(_between_pixels, points.face.size)
+            edges = between(lamps, pictures, geometry, topology, points, lit[np.array(members)])
             found.update(zip(members, edges, strict=True))
     return jnp.stack([found[i] for i in range(len(casting))])
 
@@ -122,7 +122,8 @@ def _between_pixels(
         is_lit = bright[lamp, at]
         ends = jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
         dark, bright_end = (Points(face[i], list(barycentrics[:, i]), at) for i in stored(ends))
-        edge = _edge_between(lamps, lamp, pictures, geometry, topology, dark, bright_end)
+        asked = exists & lamps.turned[lamp, dark.face]
+        edge = _edge_between(lamps, lamp, asked, pictures, geometry, topology, dark, bright_end)
         place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
@@ -208,6 +209,7 @@ def _next_to(values: Shaped[Array, "height width"]) -> Shaped[Array, "2 height w
 def _edge_between(
     lamps: _Lamps,
     lamp: Int[Array, " n"],
+    asked: Bool[Array, " n"],
     pictures: Pictures,
     geometry: Geometry,
     topology: Topology,
@@ -256,7 +258,7 @@ def _edge_between(
         return stored((looks + 1, rays, jnp.where(following >= 0, following, edge)))
 
     def is_left(state: _Look) -> Array:
-        return (state[0] < _LOOKS) & jnp.any(state[1].asked)
+        return anywhere((state[0] < _LOOKS) & jnp.any(state[1].asked))
 
     rays = Rays(
         face=dark.face,
@@ -266,7 +268,7 @@ def _edge_between(
         y=ends[0][1],
         key=zero,
         unit=zero,
-        asked=lamps.turned[lamp, dark.face],
+        asked=asked,
     )
     start = jnp.sum(dark.face & 0), rays, jnp.full_like(dark.face, -1)
     return lax.while_loop(is_left, look, start)[-1]
@@ -322,7 +324,7 @@ def _covering(
         return stored((steps + 1, jnp.where(goes_on, following, there), sign, goes_on, found))
 
     def is_on_the_way(state: _Search) -> Array:
-        return (state[0] < _STEPS) & jnp.any(state[3])
+        return anywhere((state[0] < _STEPS) & jnp.any(state[3]))
 
     zero = jnp.zeros_like(end[0])
     start = jnp.sum(jnp.zeros_like(face)), face, zero, searched & (face >= 0), face
@@ -353,7 +355,7 @@ def _follow(
         return stored((steps + 1, face, next_edge, end, turn, found, done))
 
     def is_on_the_way(state: _State) -> Array:
-        return (state[0] < _STEPS) & ~jnp.all(state[-1])
+        return anywhere((state[0] < _STEPS) & ~jnp.all(state[-1]))
 
     nothing, zero = jnp.zeros_like(face), jnp.zeros_like(ends[0][0])
     start = jnp.sum(nothing), face, nothing - 1, zero, zero, face < -1, face < 0
