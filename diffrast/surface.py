@@ -94,14 +94,7 @@ def receive_shadows(world: World, points: Points, told: Array | None = None) -> 
     """Which lights reach points, where it is not `told` for those with shadows: 1, 0, or -1."""
     if world.shadows is None:
         return (None,) * len(world.scene.lights)
-    reached = receive(world.scene.lights, world.shadows, world.geometry, points)
-    if told is None:
-        return reached
-    numbers = iter(told)
-    return tuple(
-        part if part is None else jnp.where((known := next(numbers)) < 0, part, known)
-        for part in reached
-    )
+    return receive(world.scene.lights, world.shadows, world.geometry, points, told)
 
 
 def glow(shading: str, world: World, light: Array, points: Points) -> Columns:

@@ -177,7 +177,7 @@ def _told(
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
-    only that it is dark beyond.
+    only that it is dark beyond. Of points whose colours are not used no light is asked.
     """
     if view.cast is None:
         return None
@@ -187,7 +187,9 @@ def _told(
     )
     front = jnp.where(found.fold, -1, front)
     beyond = jnp.where(found.fold & (beyond > 0), -1, beyond)
-    return jnp.concatenate([front, beyond] + [jnp.full_like(front, -1)] * (points - 2), axis=1)
+    inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
+    told = [front, beyond] + [inwards] * (points - 2)
+    return jnp.concatenate([jnp.where(found.visible, part, 0) for part in told], axis=1)
 
 
 def with_pieces(
@@ -261,7 +263,11 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         right, left = stored_together([_colors(view.image, place) for place in places])
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
-        right, left = _shade(view, method, None, *points)
+        told = None
+        if view.cast is not None:
+            unknown = jnp.where(line.used, -1, 0)
+            told = jnp.tile(unknown, (view.cast.weight.size, 2))
+        right, left = _shade(view, method, told, *points)
     jump = stored(right - left)
     value = area * jump
     sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))

@@ -77,18 +77,31 @@ def cast(
 
 
 def receive(
-    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, points: Points
+    lights: tuple[Light, ...],
+    shadows: Shadows,
+    geometry: Geometry,
+    points: Points,
+    told: Int[Array, "lights *size"] | None = None,
 ) -> Reached:
     """1 where a light reaches points, 0 where it does not, None for a light without shadows.
 
     Arguments as of `cast`; points far away from those that the shadows were cast for have whatever
-    shadow is near.
+    shadow is near. What is `told` of the lights with shadows, 1 or 0, is not asked again; -1 where
+    it is not known.
     """
     lights, geometry, points = lax.stop_gradient((lights, geometry, points))
     casting = [light for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
         regards = _regards(casting, shadows.views, shadows.turned, geometry, points)
-        return _reached(lights, shadows, geometry, points, regards)
+        if told is None:
+            return _reached(lights, shadows, geometry, points, regards)
+        asked = [
+            regard._replace(asked=regard.asked & (known < 0))
+            for regard, known in zip(regards, told, strict=True)
+        ]
+        reached = _reached(lights, shadows, geometry, points, asked)
+        known = iter(jnp.maximum(told, 0))
+        return tuple(part if part is None else part + next(known) for part in reached)
 
 
 def shone_on(
