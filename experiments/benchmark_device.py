@@ -4,15 +4,17 @@
 
 First, pixel by pixel, the face ids of each scene on the device and on the CPU. Then milliseconds
 of the ids alone, of pictures and of gradients by the camera, the light's direction and the object's
-place, with and without edges: of a sphere of 20,480 faces in all sizes, of the other scenes in the
-largest. Then views at 64² of a sphere of 5,120 faces at once, under `vmap`. Every number is a
-minimum, and what is timed ends when the result is there; "first" is the first call in seconds.
+place, with and without edges: of a sphere of 20,480 faces in all sizes, also over a floor on which
+its shadow falls, and of the other scenes in the largest. Then views at 64² of a sphere of 5,120
+faces at once, under `vmap`. Every number is a minimum, and what is timed ends when the result is
+there; "first" is the first call in seconds.
 
 Written to `--out`: `benchmark_device.json`, `.md` and `.png`.
 """
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,61 +58,75 @@ def different_ids(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, int]
     return {"covered": int((there >= 0).sum()), "different": int((here != there).sum())}
 
 
+def over_floor(scene: dr.Scene) -> dr.Scene:
+    """The scene, and a floor under its first object on which the shadow of that falls."""
+    (item,), (light,) = scene.objects, scene.lights
+    low, high = jnp.min(item.mesh.vertices, axis=0), jnp.max(item.mesh.vertices, axis=0)
+    foot = ((low + high) / 2).at[2].set(low[2])
+    size = dr.linalg.scaling(4 * jnp.max(high - low))
+    scaled = dr.linalg.compose(dr.linalg.translation(foot), size)
+    floor = dr.Object(dr.shapes.plane(1.0, 1.0), transform=scaled)
+    return dr.Scene(objects=[item, floor], lights=[replace(light, shadow=dr.Shadow())])
+
+
 def picture(
     settings: dr.RenderSettings,
+    shadow: bool,
     mesh: dr.Mesh,
     camera: dr.Camera,
     direction: Any = (-1.0, -1.0, -2.0),
     offset: Any = (0.0, 0.0, 0.0),
 ) -> jax.Array:
-    return dr.render(scene_of(mesh, direction, offset), camera, settings)
+    scene = scene_of(mesh, direction, offset)
+    return dr.render(over_floor(scene) if shadow else scene, camera, settings)
 
 
-def gradient(settings: dr.RenderSettings, mesh: dr.Mesh, camera: dr.Camera) -> Any:
+def gradient(settings: dr.RenderSettings, shadow: bool, mesh: dr.Mesh, camera: dr.Camera) -> Any:
     """Of the sum of squares, by the camera, the light's direction and the object's place."""
 
     def loss(*parameters: Any) -> jax.Array:
-        return jnp.sum(picture(settings, mesh, *parameters) ** 2)
+        return jnp.sum(picture(settings, shadow, mesh, *parameters) ** 2)
 
     return jax.grad(loss, (0, 1, 2))(camera, jnp.array([-1.0, -1, -2]), jnp.zeros(3))
 
 
 def pipelines(
-    size: int, antialias: bool
-) -> dict[str, tuple[Callable[..., Any], dr.RenderSettings]]:
-    """Functions of a mesh and a camera, once the settings are given; the cheapest first."""
+    size: int, antialias: bool, shadows: Sequence[bool]
+) -> dict[str, Callable[[dr.Mesh, dr.Camera], Any]]:
+    """What draws and differentiates, without and with shadows and edges."""
     kinds = {", no edges": dr.RenderSettings(height=size, width=size, antialias=False)}
     if antialias:
         kinds[""] = dr.RenderSettings(height=size, width=size)
     return {
-        f"{what}{word}": (function, settings)
+        f"{what}{', shadow' if shadow else ''}{word}": partial(function, settings, shadow)
+        for shadow in shadows
         for what, function in (("picture", picture), ("gradient", gradient))
         for word, settings in kinds.items()
     }
 
 
 def stages(
-    mesh: dr.Mesh, camera: dr.Camera, size: int, antialias: bool = True
+    mesh: dr.Mesh, camera: dr.Camera, size: int, antialias: bool, shadows: Sequence[bool]
 ) -> dict[str, Callable[[], Any]]:
-    """What is timed of one view, from the cheapest on."""
+    """What is timed of one view."""
     ids = partial(visible_faces, height=size, width=size, cull_backfaces=False)
     clip, faces = dr.world_to_clip(camera, mesh.vertices), jnp.asarray(mesh.faces)
     jobs: dict[str, Callable[[], Any]] = {"ids": lambda: ids(clip, faces)}
-    for what, (function, settings) in pipelines(size, antialias).items():
-        jobs[what] = compiled(partial(function, settings), mesh, camera)
+    beside = jax.tree.map(lambda column: column[0], cameras(mesh, 1))  # the shadow is in view
+    for what, function in pipelines(size, antialias, shadows).items():
+        jobs[what] = compiled(function, mesh, beside if "shadow" in what else camera)
     return jobs
 
 
 def many(
-    mesh: dr.Mesh, count: int, size: int, antialias: bool = True
+    mesh: dr.Mesh, count: int, size: int, antialias: bool, shadows: Sequence[bool]
 ) -> dict[str, Callable[[], Any]]:
     """What is timed of many views at once."""
     views = cameras(mesh, count)
-    jobs: dict[str, Callable[[], Any]] = {}
-    for what, (function, settings) in pipelines(size, antialias).items():
-        of_each = jax.vmap(partial(function, settings), (None, 0))
-        jobs[what] = compiled(of_each, mesh, views)
-    return jobs
+    return {
+        what: compiled(jax.vmap(function, (None, 0)), mesh, views)
+        for what, function in pipelines(size, antialias, shadows).items()
+    }
 
 
 def run(
@@ -122,6 +138,7 @@ def run(
     repeats: int = 20,
     known: dict[str, tuple[dr.Mesh, dr.Camera]] | None = None,
     antialias: bool = True,
+    shadows: Sequence[bool] = (False, True),
     progress: bool = False,
 ) -> dict[str, Any]:
     """Compare and measure; return what is written."""
@@ -140,13 +157,13 @@ def run(
             add("ids", {"scene": name, "size": size, **different_ids(mesh, camera, size)})
     for name, (mesh, camera) in known.items():
         for size in sizes if name == first else sizes[-1:]:
-            for what, job in stages(mesh, camera, size, antialias).items():
+            for what, job in stages(mesh, camera, size, antialias, shadows).items():
                 if name == first or what in ("ids", "picture", "gradient"):
                     row = {"scene": name, "what": what, "size": size}
                     add("stages", row | timed(job, repeats))
     mesh = dr.shapes.icosphere(4)
     for count in views:
-        for what, job in many(mesh, count, view_size, antialias).items():
+        for what, job in many(mesh, count, view_size, antialias, shadows).items():
             found = timed(job, repeats)
             row = {"what": what, "size": view_size, "views": count, **found}
             add("views", row | {"a_second": 1e3 * count / found["ms"]})

@@ -313,15 +313,14 @@ def test_views_are_timed(tmp_path):
 def test_the_device_is_compared_and_timed(tmp_path):
     _, camera = benchmark_device.scenes()["sphere, 5,120 faces"]
     known = {"ball": (dr.shapes.icosphere(1), camera), "cube": (dr.shapes.cube(), camera)}
-    benchmark_device.run(
-        tmp_path, sizes=(8,), views=(2,), view_size=8, repeats=1, known=known, antialias=False
-    )
+    small = {"sizes": (8,), "views": (2,), "view_size": 8, "repeats": 1}
+    benchmark_device.run(tmp_path, known=known, antialias=False, shadows=(True,), **small)
     written = read(tmp_path, "benchmark_device")
     assert [(row["scene"], row["size"], row["different"]) for row in written["ids"]] == [
         (scene, 8, 0) for scene in known
     ]
     rows = [(row["scene"], row["what"], row["size"]) for row in written["stages"]]
-    whats = ("ids", "picture, no edges", "gradient, no edges")
+    whats = ("ids", "picture, shadow, no edges", "gradient, shadow, no edges")
     assert rows == [*(("ball", what, 8) for what in whats), ("cube", "ids", 8)]
     assert [row["what"] for row in written["views"]] == list(whats[1:])
     assert all(row["ms"] > 0 for row in written["stages"] + written["views"])

@@ -15,7 +15,7 @@ from diffrast.edges.planes import Table, corners_of, covers, edge_values
 
 _STEPS = 40
 _WAYS_AT_ONCE = 512
-_MOST = 4  # of so many, mostly one
+_SHARE = 4  # of so many places mostly one at most begins a way
 _BLOCK = 4  # pixels
 
 
@@ -134,6 +134,6 @@ def walk(
         return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
 
     nowhere = jnp.minimum(face, -1), face < 0
-    some = -(-face.size // _MOST) if views_fill_lanes() else at_once(_WAYS_AT_ONCE, face.size)
+    some = -(-face.size // _SHARE) if views_fill_lanes() else at_once(_WAYS_AT_ONCE, face.size)
     ends, arrived = over_batches(order, count, some, go, nowhere)
     return ends.reshape(shape), arrived.reshape(shape)
