@@ -1,6 +1,6 @@
 """A scene as one mesh in the world, and the points of it that are seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,11 +23,11 @@ from diffrast.linalg import (
     mirrors,
     norm,
     normal_matrix,
-    transform_normals,
+    normalize,
     transform_points,
     where_finite,
 )
-from diffrast.mesh import face_normals, vertex_normals
+from diffrast.mesh import Mesh, face_normals, vertex_normals
 from diffrast.raster.coverage import visible_faces
 from diffrast.raster.evaluate import (
     Carried,
@@ -40,9 +40,9 @@ from diffrast.raster.evaluate import (
     evaluate,
 )
 from diffrast.raster.fragments import with_border
-from diffrast.scene import Object, Scene
+from diffrast.scene import Scene
 
-FEW_OBJECTS = 16  # what their transforms move is summed over the picture, for each of them
+FEW_OBJECTS = 32  # what their transforms move is summed over the picture, for each of them
 _SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
 
 
@@ -73,91 +73,117 @@ class Points(NamedTuple):
 def world_geometry(scene: Scene, shading: str) -> Geometry:
     """All objects in the world, with what this shading needs of them."""
     with jax.named_scope("geometry"):
-        positions, faces, faces_outward, normals, uvs, uv_faces = [], [], [], [], [], []
-        smooth = shading in ("phong", "gouraud")
-        textured = any(item.mesh.uvs is not None for item in scene.objects)
-        own_uvs = any(item.mesh.uv_faces is not None for item in scene.objects)
-        first_vertex = first_uv = 0
-        for item in scene.objects:
-            mesh = item.mesh
-            positions.append(where_finite(partial(transform_points, item.transform), mesh.vertices))
-            faces.append(mesh.faces + first_vertex)
-            turned = jnp.where(mirrors(item.transform), faces[-1][:, ::-1], faces[-1])
-            faces_outward.append(turned)
-            first_vertex += mesh.vertices.shape[0]
-            if smooth:
-                turn = partial(transform_normals, item.transform)
-                normals.append(where_finite(turn, _own_normals(item)))
-            if textured:
-                own = mesh.uvs
-                none = jnp.zeros_like(mesh.vertices[:, :2])
-                uvs.append(none if own is None else own)
-            if own_uvs:
-                corners = mesh.faces if mesh.uv_faces is None else mesh.uv_faces
-                uv_faces.append(corners + first_uv)
-                first_uv += uvs[-1].shape[0]
-        all_faces = jnp.concatenate(faces)
-
-        def joined(parts: list[Array]) -> Array:
-            return stored_rows(jnp.concatenate(parts))
-
-        counts = np.arange(len(scene.objects), dtype=np.int32)
+        meshes = [item.mesh for item in scene.objects]
+        vertices, smooth = [mesh.vertices for mesh in meshes], shading in ("phong", "gouraud")
+        transforms = jnp.stack([item.transform for item in scene.objects])
+        object_of_face = _owner([mesh.faces for mesh in meshes])
+        faces = _numbered([mesh.faces for mesh in meshes], vertices)
+        mirrored = jax.vmap(mirrors)(transforms)
+        turned_round = mirrored[object_of_face][:, None] if len(meshes) > 1 else mirrored
+        normals = uvs = uv_faces = None
+        if smooth:
+            own = [_own_normals(mesh) for mesh in meshes]
+            normals = stored_rows(_in_world(_turned, _turns(transforms), own))
+        if any(mesh.uvs is not None for mesh in meshes):
+            own = [jnp.zeros_like(m.vertices[:, :2]) if m.uvs is None else m.uvs for m in meshes]
+            uvs = stored_rows(jnp.concatenate(own))
+            if any(mesh.uv_faces is not None for mesh in meshes):
+                corners = [m.faces if m.uv_faces is None else m.uv_faces for m in meshes]
+                uv_faces = _numbered(corners, own)
         return Geometry(
-            joined(positions),
-            all_faces,
-            jnp.concatenate(faces_outward),
-            joined(normals) if smooth else None,
-            joined(uvs) if textured else None,
-            jnp.concatenate(uv_faces) if own_uvs else all_faces,
-            jnp.asarray(np.repeat(counts, [o.mesh.faces.shape[0] for o in scene.objects])),
-            jnp.asarray(np.repeat(counts, [o.mesh.vertices.shape[0] for o in scene.objects])),
+            stored_rows(_in_world(transform_points, transforms, vertices)),
+            faces,
+            jnp.where(turned_round, faces[:, ::-1], faces),
+            normals,
+            uvs,
+            faces if uv_faces is None else uv_faces,
+            jnp.asarray(object_of_face),
+            jnp.asarray(_owner(vertices)),
         )
 
 
-def _own_normals(item: Object) -> Array:
-    mesh = item.mesh
+def _owner(parts: Sequence[Any]) -> np.ndarray:
+    """Which object each row of the joined parts is of."""
+    counts = [part.shape[0] for part in parts]
+    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+
+
+def _numbered(parts: Sequence[Array], counted: Sequence[Any]) -> Int[Array, "rows *size"]:
+    """Indices into an array of each object, joined, as indices into these arrays, joined as well.
+
+    Negative ones are none and stay so.
+    """
+    joined = jnp.concatenate(parts)
+    if len(parts) == 1:
+        return joined
+    first = np.cumsum([0] + [rows.shape[0] for rows in counted], dtype=np.int32)[_owner(parts)]
+    return joined + jnp.where(joined < 0, 0, first.reshape(-1, *[1] * (joined.ndim - 1)))
+
+
+def _in_world(
+    function: Callable[..., Array], matrices: Float[Array, "objects rows columns"], parts: list
+) -> Float[Array, "V 3"]:
+    """`function(matrix, vectors)` for the vectors of each object, joined; see `where_finite`.
+
+    Of several objects each vector has a matrix of its own: the program does not grow with them.
+    """
+    if len(parts) == 1:
+        return where_finite(partial(function, matrices[0]), parts[0])
+    of_each = partial(jax.vmap(function), matrices[_owner(parts)])
+    return where_finite(of_each, jnp.concatenate(parts))
+
+
+_turns = jax.vmap(normal_matrix)
+
+
+def _turned(matrix: Array, normals: Array) -> Array:
+    """Unit normals, turned by the matrix that turns normals."""
+    return normalize(apply_matrix(matrix, normals))
+
+
+def _own_normals(mesh: Mesh) -> Array:
     return vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
 
 
 def _placed(scene: Scene, geometry: Geometry) -> Placed:
     """Where objects come from, for derivatives by their transforms."""
-    placements, positions, normals, fixed = [], [], [], []
-    for item in scene.objects:
-        transform, vertices = item.transform, item.mesh.vertices
-        positions.append(where_finite(lambda points: points, vertices))
-        attributes = [_placed_by(transform_points, transform, vertices)]
-        turn = None
-        if geometry.normals is not None:
-            turn, own = normal_matrix(transform), _own_normals(item)
-            normals.append(where_finite(partial(_shortened, turn), own))
-            attributes.append(_placed_by(transform_normals, transform, own))
-        placements.append(Placement(transform[:3], turn))
-        fixed.append(attributes)
+    transforms = [item.transform for item in scene.objects]
+    vertices, matrices = [item.mesh.vertices for item in scene.objects], jnp.stack(transforms)
+    turns: list[Array | None] = [None] * len(transforms)
+    attributes, normals = [_placed_by(transform_points, matrices, vertices)], None
+    if geometry.normals is not None:
+        turns = [normal_matrix(transform) for transform in transforms]
+        own, matrices = [_own_normals(item.mesh) for item in scene.objects], _turns(matrices)
+        attributes.append(_placed_by(_turned, matrices, own))
+        normals = stored_rows(_in_world(_shortened, matrices, own))
     return Placed(
-        tuple(placements),
+        tuple(Placement(m[:3], turn) for m, turn in zip(transforms, turns, strict=True)),
         geometry.object_of_face,
-        stored_rows(jnp.concatenate(positions)),
-        stored_rows(jnp.concatenate(normals)) if normals else None,
-        tuple(stored_rows(jnp.concatenate(parts)) for parts in zip(*fixed, strict=True)),
+        stored_rows(where_finite(lambda points: points, jnp.concatenate(vertices))),
+        normals,
+        tuple(map(stored_rows, attributes)),
     )
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _placed_by(function: Callable[..., Array], transform: Array, vectors: Array) -> Array:
-    """What a transform makes of vectors, with their derivative and without its own."""
-    return where_finite(partial(function, transform), vectors)
+def _placed_by(function: Callable[..., Array], matrices: Array, parts: list[Array]) -> Array:
+    """`_in_world` with the derivative by the vectors and without that by the matrices."""
+    return _in_world(function, matrices, parts)
 
 
 @partial(_placed_by.defjvp, symbolic_zeros=True)
 def _placed_derivative(
     function: Callable[..., Array], primals: Any, tangents: Any
 ) -> tuple[Array, Any]:
-    transform, vectors = primals
-    placed = _placed_by(function, transform, vectors)  # whose derivative, again, is this one
-    if isinstance(tangents[1], SymbolicZero):
+    matrices, parts = primals
+    placed = _placed_by(function, *primals)  # whose derivative, again, is this one
+    if all(isinstance(change, SymbolicZero) for change in tangents[1]):
         return placed, SymbolicZero.from_primal_value(placed)
-    own = partial(where_finite, partial(function, transform))
-    return placed, jax.jvp(own, (vectors,), (tangents[1],))[1]
+    changes = [
+        jnp.zeros_like(part) if isinstance(change, SymbolicZero) else change
+        for part, change in zip(parts, tangents[1], strict=True)
+    ]
+    return placed, jax.jvp(partial(_in_world, function, matrices), (parts,), (changes,))[1]
 
 
 def _shortened(matrix: Array, normals: Array) -> Array:
@@ -263,28 +289,16 @@ def scene_topology(scene: Scene) -> Topology:
     own = [
         traced_topology(m.vertices, m.faces) if m.topology is None else m.topology for m in meshes
     ]
-    first_faces = np.cumsum([0] + [m.faces.shape[0] for m in meshes])
-    first_vertices = np.cumsum([0] + [m.vertices.shape[0] for m in meshes])
-
-    def moved(faces: Array, by: int) -> Array:
-        return jnp.where(faces >= 0, faces + by, -1) if by else faces
-
-    edges = [
-        part.edges._replace(faces=moved(part.edges.faces, int(first)))
-        for part, first in zip(own, first_faces, strict=False)
-    ]
+    faces, vertices = [m.faces for m in meshes], [m.vertices for m in meshes]
+    edges = Edges(
+        *(jnp.concatenate(column) for column in zip(*(t.edges for t in own), strict=True))
+    )
     bodies = [jnp.zeros_like(t.patches) if t.bodies is None else t.bodies for t in own]
-
-    def numbered(parts: list[Array]) -> Array:
-        return jnp.concatenate([p + int(v) for p, v in zip(parts, first_vertices, strict=False)])
-
     return Topology(
-        Edges(*(jnp.concatenate(column) for column in zip(*edges, strict=True))),
-        jnp.concatenate(
-            [moved(t.neighbors, int(f)) for t, f in zip(own, first_faces, strict=False)]
-        ),
-        numbered([t.patches for t in own]),
-        None if len(own) == 1 and own[0].bodies is None else numbered(bodies),
+        edges._replace(faces=_numbered([t.edges.faces for t in own], faces)),
+        _numbered([t.neighbors for t in own], faces),
+        _numbered([t.patches for t in own], vertices),
+        None if len(own) == 1 and own[0].bodies is None else _numbered(bodies, vertices),
     )
 
 

@@ -120,6 +120,22 @@ def test_what_does_not_move_has_no_part_for_the_geometry(part, antialias):
     assert to_vertices(scene(material), part, settings(antialias=antialias)) == 0
 
 
+@pytest.mark.parametrize("part", [None, "transform", "vertices"])
+def test_further_objects_add_few_operations(part):
+    """What all have in common is made at once; an object of its own adds its numbers to tables."""
+
+    def counted(number):
+        given = dataclasses.replace(scene(), objects=scene().objects * number)
+        if part is None:
+            return sum(operations(dr.render, given, CAMERA, settings()).values())
+        program, arguments = gradient(given, part, settings())
+        return sum(operations(program, *arguments).values())
+
+    several, more = counted(40), counted(60)
+    assert (more - several) / 20 < 30
+    assert several < 1.3 * counted(2)
+
+
 # A camera's motion and that of few objects are summed over the picture; that of vertices has the
 # three corners' x, y and z, for positions and for normals.
 @pytest.mark.parametrize(

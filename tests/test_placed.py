@@ -96,6 +96,28 @@ def test_derivatives_are_those_by_vertices(by_vertices, monkeypatch, way):
         assert np.linalg.norm(some - expected) < 1e-9 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("moving", [[1], [0, 2]])
+def test_objects_that_do_not_move_have_no_part(by_vertices, moving):
+    """The change of the picture is that of those transforms that change."""
+    (start, way, _), _ = by_vertices
+
+    def moved(*transforms):
+        given = list(start["transforms"])
+        for number, transform in zip(moving, transforms, strict=True):
+            given[number] = transform
+        return picture(start | {"transforms": given})
+
+    def moved_all(*transforms):
+        return picture(start | {"transforms": list(transforms)})
+
+    some = [[tree["transforms"][k] for k in moving] for tree in (start, way)]
+    still = [w if k in moving else 0 * w for k, w in enumerate(way["transforms"])]
+    found = jax.jit(lambda: jax.jvp(moved, *map(tuple, some))[1])()
+    wanted = jax.jit(lambda: jax.jvp(moved_all, tuple(start["transforms"]), tuple(still))[1])()
+    assert np.linalg.norm(wanted) > 0
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+
+
 def test_derivatives_are_those_of_the_picture(by_vertices):
     (start, way, _), _ = by_vertices
     still = jnp.zeros((4, 4))  # the flat sheet would turn over

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float, Int
@@ -261,16 +262,20 @@ def _moved(
     several = len(changes) > 1
     object_of = placed.object_of_face[jnp.maximum(pixels.face, 0)] if several else 0
 
-    def of_each(matrices: list[Any], change_by: Callable[[Array], Columns]) -> Columns | None:
+    def of_each(matrices: list[Any], change_by: Callable[[Any], Columns]) -> Columns | None:
         """The change by the matrix of the object that a pixel sees, of those that change."""
-        columns = None
-        for number, matrix in enumerate(matrices):
-            if not isinstance(matrix, SymbolicZero):
-                here = covered & (object_of == number)
-                others = columns or [jnp.zeros_like(seen.inverse_depth)] * 3
-                parts = zip(change_by(matrix), others, strict=True)
-                columns = [jnp.where(here, part, other) for part, other in parts]
-        return columns and stored(columns, seen.inverse_depth)
+        known = {k: m for k, m in enumerate(matrices) if not isinstance(m, SymbolicZero)}
+        if not known:
+            return None
+        number = np.array(list(known)).reshape(-1, *[1] * pixels.face.ndim)
+        here = covered & (object_of == number)
+        if len(known) == 1:
+            change = [jnp.where(here[0], part, 0) for part in change_by(*known.values())]
+        else:  # as a product, whose transpose sums over the picture for all of them at once
+            shares = stored(here.astype(seen.inverse_depth.dtype))
+            matrix = jnp.stack(list(known.values()), axis=-1)
+            change = change_by(jnp.tensordot(matrix, shares, 1, precision=lax.Precision.HIGHEST))
+        return stored(change, seen.inverse_depth)
 
     (at_corners,) = _at_corners((placed.positions,), seen)
     position = stored([blend(b, corners) for corners in at_corners])
