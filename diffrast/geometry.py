@@ -24,7 +24,6 @@ from diffrast.linalg import (
     norm,
     normal_matrix,
     normalize,
-    transform_points,
     where_finite,
 )
 from diffrast.mesh import Mesh, face_normals, vertex_normals
@@ -91,7 +90,7 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
                 corners = [m.faces if m.uv_faces is None else m.uv_faces for m in meshes]
                 uv_faces = _numbered(corners, own)
         return Geometry(
-            stored_rows(_in_world(transform_points, transforms, vertices)),
+            stored_rows(_in_world(_moved, transforms[:, :3], vertices)),
             faces,
             jnp.where(turned_round, faces[:, ::-1], faces),
             normals,
@@ -133,6 +132,11 @@ def _in_world(
     return where_finite(of_each, jnp.concatenate(parts))
 
 
+def _moved(matrix: Array, points: Array) -> Array:
+    """Points where the rows of an affine matrix put them."""
+    return apply_matrix(matrix[:, :3], points) + matrix[:, 3]
+
+
 _turns = jax.vmap(normal_matrix)
 
 
@@ -150,7 +154,7 @@ def _placed(scene: Scene, geometry: Geometry) -> Placed:
     transforms = [item.transform for item in scene.objects]
     vertices, matrices = [item.mesh.vertices for item in scene.objects], jnp.stack(transforms)
     turns: list[Array | None] = [None] * len(transforms)
-    attributes, normals = [_placed_by(transform_points, matrices, vertices)], None
+    attributes, normals = [_placed_by(_moved, matrices[:, :3], vertices)], None
     if geometry.normals is not None:
         turns = [normal_matrix(transform) for transform in transforms]
         own, matrices = [_own_normals(item.mesh) for item in scene.objects], _turns(matrices)
