@@ -234,10 +234,11 @@ def positive_part(first: Sequence[Array], last: Sequence[Array]) -> tuple[Array,
     """
     begin, end = jnp.zeros_like(first[0]), jnp.ones_like(first[0])
     for a, b in zip(first, last, strict=True):
-        # At most one it is anyway; of a division itself XLA would make a pass of its own.
-        crossing = jnp.minimum(a / jnp.where((a < 0) == (b < 0), 1, a - b), 1)
-        begin = jnp.where(a < 0, jnp.where(b < 0, 2, jnp.maximum(begin, crossing)), begin)
-        end = jnp.where((a >= 0) & (b < 0), jnp.minimum(end, crossing), end)
+        # The same quotient, written in two ways: XLA makes a pass of its own of what is used twice.
+        alike = (a < 0) == (b < 0)
+        enters, leaves = a / jnp.where(alike, 1, a - b), -a / jnp.where(alike, 1, b - a)
+        begin = jnp.where(a < 0, jnp.where(b < 0, 2, jnp.maximum(begin, enters)), begin)
+        end = jnp.where((a >= 0) & (b < 0), jnp.minimum(end, leaves), end)
     return stored_together((begin, end))
 
 
