@@ -83,7 +83,13 @@ def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, "
 
 def batches_of(count: Int[Array, ""], at_once: int) -> Int[Array, ""]:
     """How many batches so many make."""
-    return (count + at_once - 1) // at_once
+    return divided(count + (at_once - 1), at_once)[0]
+
+
+def divided(number: Int[Array, "*n"], by: Array | int) -> tuple[Array, Array]:
+    """Quotient and remainder of numbers that are not negative: one division, and no signs."""
+    quotient = lax.div(number, jnp.broadcast_to(jnp.asarray(by, number.dtype), number.shape))
+    return quotient, number - by * quotient
 
 
 def over_batches(

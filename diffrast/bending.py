@@ -7,7 +7,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import at_once, over_views
-from diffrast._selection import compacted, over_batches
+from diffrast._selection import compacted, divided, over_batches
 from diffrast._stored import stored, zero_after
 
 _Lists: TypeAlias = tuple[Array, Array, Array, Array]  # two, and the lengths of both
@@ -146,7 +146,8 @@ def _largest(values: Array, least: Array, last: Array) -> Chosen:
 
         def add(block: Array, exists: Array, found: _Lists) -> _Lists:
             ahead, behind, before, after = found
-            first = block // width * _BLOCK * width + block % width
+            row, column = divided(block, width)
+            first = row * (_BLOCK * width) + column
             number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
             value = values.reshape(-1).at[number].get(mode="fill", fill_value=0)
             chosen = stored(exists & (value > least)).reshape(-1)

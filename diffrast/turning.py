@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, at_once, most, over_views
 from diffrast._linear import linear_map, linear_zeros
-from diffrast._selection import batches_of, compacted, over_batches
+from diffrast._selection import batches_of, compacted, divided, over_batches
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
@@ -116,7 +116,7 @@ def with_turns(
         apart: Array,
     ) -> _Points:
         chosen = bending(turning, image)
-        row, column = jnp.divmod(chosen.number, width)
+        row, column = divided(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
         face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart)
         return _Points(chosen, face, lit)
@@ -127,7 +127,7 @@ def with_turns(
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     number, _, total = points.chosen
     place = jnp.arange(number.size)
-    row, column = jnp.divmod(number, width)
+    row, column = divided(number, width)
     row = jnp.where(place < total, row, height + place)  # none twice
     return image.at[row, column].add(added, mode="drop", unique_indices=True)
 
@@ -169,7 +169,7 @@ def _faces_at(
 
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(chosen, n, count)
-            row, column = stored(jnp.divmod(chosen.number[place], width - 2))
+            row, column = stored(divided(chosen.number[place], width - 2))
             x0, y0 = (at.astype(clip.dtype) + 1.5 for at in (column, row))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
             right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
@@ -325,7 +325,7 @@ def _of_parts(
 ) -> Float[Array, "some 3"]:
     """What `_added` finds for parts of the batch `n`: of what is not seen, edges tell."""
     data, drawn, points = inputs
-    row, column = jnp.divmod(points.chosen.number[parts.place], size[1])
+    row, column = divided(points.chosen.number[parts.place], size[1])
     some = row.size
     face = lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
     full = size[0] + 2, size[1] + 2

@@ -1,15 +1,16 @@
-"""How does the time grow with faces, pixels, lights, views and parameters?
+"""How does the time grow with faces, pixels, objects, lights, views and parameters?
 
     python experiments/benchmark_scaling.py [--quick] [--repeats 10]
 
 One of them grows while the others stay: a height field of 100 to a million faces, pictures of 64²
-to 4096² pixels, 1 to 16 directional lights, 1 to 64 views in one call, and the derivative by 10 to
-5,000 of the vertices' coordinates. "picture" is without edges, "edges" with them, "derivative" that
-of a weighted sum of the jagged picture by the object's translation, or by the parameters that grow.
-Each exponent is the slope of the straight line through the times, both axes logarithmic.
+to 4096² pixels, 10,000 faces in 1 to 256 objects side by side, 1 to 16 directional lights, 1 to 64
+views in one call, and the derivative by 10 to 5,000 of the vertices' coordinates. "picture" is
+without edges, "edges" with them, "derivative" that of a weighted sum of the jagged picture by every
+object's translation, or by the parameters that grow. Each exponent is the slope of the straight
+line through the times, both axes logarithmic.
 
-Expected: below one for faces (pixels cost, too) and lights, about one for pixels and views, and
-zero for parameters: the derivative's price does not depend on their number.
+Expected: below one for faces (pixels cost, too), objects and lights, about one for pixels and
+views, and zero for parameters: the derivative's price does not depend on their number.
 
 Written to `--out`: `benchmark_scaling.json`, `.md` and `.png`. Fifteen minutes on two cores, most
 of it compilation.
@@ -30,6 +31,7 @@ import diffrast as dr
 COUNTS = {
     "faces": (1e2, 1e3, 1e4, 1e5, 1e6),
     "pixels": (64**2, 256**2, 1024**2, 4096**2),
+    "objects": (1, 16, 256),
     "lights": (1, 4, 16),
     "views": (1, 8, 64),
     "parameters": (10, 200, 5000),
@@ -37,6 +39,7 @@ COUNTS = {
 QUICK = {
     "faces": (1e2, 1e3),
     "pixels": (32**2, 64**2),
+    "objects": (1, 4),
     "lights": (1, 2),
     "views": (1, 2),
     "parameters": (10, 100),
@@ -77,18 +80,27 @@ def weights(size: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(0).normal(size=(size, size, 3)), jnp.float32)
 
 
-def drawing(mesh: dr.Mesh, size: int, count: int = 1, *, edges: bool = True) -> Jobs:
-    """A picture without edges, with them, and the derivative by the object's translation."""
+def drawing(mesh: dr.Mesh, size: int, count: int = 1, *, side: int = 1, edges: bool = True) -> Jobs:
+    """A picture without edges, with them, and the derivative by the translations of the objects.
 
-    def picture(offset: jax.Array, mesh: dr.Mesh, lights: Any, antialias: bool) -> jax.Array:
-        item = dr.Object(mesh, None, dr.linalg.translation(offset))
-        scene = dr.Scene(objects=[item], lights=lights)
+    These are so many a side, where else there is one.
+    """
+    middles = (np.arange(side) * 2 + 1) / side - 1
+    places = jnp.asarray([(x, y, 0) for y in middles for x in middles], jnp.float32)
+    smaller = dr.linalg.scaling(np.full(3, 1 / side))
+
+    def picture(places: jax.Array, mesh: dr.Mesh, lights: Any, antialias: bool) -> jax.Array:
+        objects = [
+            dr.Object(mesh, None, dr.linalg.compose(dr.linalg.translation(place), smaller))
+            for place in places
+        ]
+        scene = dr.Scene(objects=objects, lights=lights)
         return dr.render(scene, camera(), settings(size, antialias=antialias))
 
-    def weighted(offset: jax.Array, weights: jax.Array, mesh: dr.Mesh, lights: Any) -> jax.Array:
-        return jnp.vdot(weights, picture(offset, mesh, lights, False))
+    def weighted(places: jax.Array, weights: jax.Array, mesh: dr.Mesh, lights: Any) -> jax.Array:
+        return jnp.vdot(weights, picture(places, mesh, lights, False))
 
-    arguments = jnp.zeros(3), mesh, lights(count)
+    arguments = places, mesh, lights(count)
     jobs = {
         "picture": compiled(lambda *a: picture(*a, False), *arguments),
         "derivative": compiled(jax.grad(weighted), arguments[0], weights(size), *arguments[1:]),
@@ -127,6 +139,9 @@ def series(counts: dict[str, Sequence[float]], size: int) -> Iterator[tuple[str,
         yield "faces", field.faces.shape[0], drawing(field, size)
     for count in counts.get("pixels", ()):
         yield "pixels", count, drawing(mesh, round(count**0.5), edges=count <= 1024**2)
+    for count in counts.get("objects", ()):
+        side = round(count**0.5)
+        yield "objects", count, drawing(height_field(10_000 / count), size, side=side)
     for count in counts.get("lights", ()):
         yield "lights", count, drawing(mesh, size, int(count), edges=False)
     for count in counts.get("views", ()):

@@ -166,7 +166,8 @@ def _shade(
         scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
         barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
         total = barycentrics[0] + barycentrics[1] + barycentrics[2]
-        barycentrics = [part / jnp.where(total > 0, total, 1) for part in barycentrics]
+        inverse_total = 1 / jnp.where(total > 0, total, 1)
+        barycentrics = [part * inverse_total for part in barycentrics]
     colors = stored_together(method.shader(view.scene, face, barycentrics, told))
     return jnp.split(jnp.stack(colors), len(points), axis=1)
 

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Int
 
 from diffrast._device import anywhere, lanes
-from diffrast._selection import batches_of, over_batches, prefix_sum
+from diffrast._selection import batches_of, divided, over_batches, prefix_sum
 from diffrast._stored import stored, zero_after
 from diffrast.edges.blend import (
     Blended,
@@ -178,7 +178,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
     lines_at_once = lanes() * LINES_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
-        pixel = stored(jnp.stack([number % width, number // width]))
+        pixel = stored(jnp.stack(divided(number, width)[::-1]))
         crossings = cross(
             pixel,
             exists,
@@ -205,12 +205,12 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
     shadows_at_once = lanes() * SHADOWS_AT_ONCE
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
-        light = number // (width * height)
+        light, place = divided(number, width * height)
         weight_of_light = pixels.shape[1] - cast.weight.size + light
         places = Places(
             light,
             rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
-            pixel=jnp.stack([number % width, number // width % height]),
+            pixel=jnp.stack(divided(place, width)[::-1]),
         )
         outlines = cross_shadows(
             places, exists, cast, view.faces, view.topology.neighbors, pixels, view.face_image

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
@@ -320,9 +321,11 @@ def first_ones(waiting: Waiting, at_once: AtOnce) -> Pieces:
 
     What hides a piece here and there is found one part after the other.
     """
-    parts = jnp.where(waiting.total <= at_once.few, at_once.parts, 1)
-    number = jnp.arange(at_once.pieces)
-    piece, part = number // parts, number % parts
+    few = waiting.total <= at_once.few
+    parts = jnp.where(few, at_once.parts, 1)
+    number = np.arange(at_once.pieces, dtype=np.int32)
+    piece = jnp.where(few, number // at_once.parts, number)
+    part = jnp.where(few, number % at_once.parts, 0)
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
     begin, end = range_
     length = (end - begin) / parts

@@ -24,7 +24,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere
-from diffrast._selection import selected
+from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round, steps_to, walk
@@ -291,8 +291,8 @@ def _left_of(normal: Array) -> Array:
 @jax.jit
 def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, " n"]) -> Line:
     """The lines along which these pairs of faces pierce each other, where they are visible."""
-    at_once = crossings.unit.size
-    one, other, place = pair // at_once // _FACES, pair // at_once % _FACES, pair % at_once
+    both_faces, place = divided(pair, crossings.unit.size)
+    one, other = divided(both_faces, _FACES)
     pixel, planes = stored_together(
         jax.tree.map(lambda part: part[..., place], (crossings.pixel, crossings.planes))
     )

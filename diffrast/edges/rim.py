@@ -44,7 +44,10 @@ def next_inwards(
 def _reach(
     point: Float[Array, "2 *size"], inward: Float[Array, "2 *size"]
 ) -> Float[Array, "*size"]:
-    exits = (0.5 - jnp.sign(inward) * point) / jnp.maximum(abs(inward), _SMALL)
+    exits = [
+        (0.5 - jnp.sign(way) * at) / jnp.maximum(abs(way), _SMALL)
+        for way, at in zip(inward, point, strict=True)
+    ]
     return stored(jnp.clip(jnp.minimum(*exits), 0, 1.5))
 
 

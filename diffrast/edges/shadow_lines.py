@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._selection import selected
+from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
 from diffrast.edges.neighborhood import first_row, picked, pixels_round, steps_to
 from diffrast.edges.pieces import Depth, positive_part
@@ -323,8 +323,8 @@ def shadow_of(
     faces: Int[Array, "F 3"],
 ) -> Shadow:
     """These lines, and how they move."""
-    row, place = jnp.divmod(line, outlines.weight.size)
-    edge, column = row // _FACES, row % _FACES
+    row, place = divided(line, outlines.weight.size)
+    edge, column = divided(row, _FACES)
 
     def of_edge(values: Array) -> Array:
         return values[..., edge, place]

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from diffrast._selection import batches_of
+from diffrast._selection import batches_of, divided
 from diffrast._stored import stored, stored_together
 from diffrast.raster.edge_functions import (
     TILE,
@@ -296,8 +296,8 @@ class _Tile(NamedTuple):
 
 def _tile_at(number: Array, image: Image) -> _Tile:
     rows, columns = _tile_counts(image)
-    row, column = number // columns % rows, number % columns
-    face = number // (rows * columns)
+    row, column = divided(number, columns)
+    face, row = divided(row, rows)
     return _Tile(number, face, (row, column), row * TILE[0], column * TILE[1])
 
 
@@ -310,7 +310,7 @@ class _Walk(NamedTuple):
     columns: int
 
     def after(self, tile: Array) -> Array:
-        row = tile // self.columns
+        row, _ = divided(tile, self.columns)
         return jnp.where(tile < self.last_in_row[row], tile + 1, self.first_of_next[row])
 
 

@@ -16,7 +16,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import lanes
-from diffrast._selection import compacted, over_batches, selected, work_off
+from diffrast._selection import compacted, divided, over_batches, selected, work_off
 from diffrast._stored import stored
 from diffrast.edges.planes import cross_rows
 from diffrast.geometry import Geometry
@@ -138,7 +138,8 @@ def _hidden(
     def begin(way: Array) -> _Way:
         face = at_texels(pictures.face, stored(sight.texels.reshape(-1)[way]))
         zero = jnp.zeros_like(way)
-        return _Way(way % count, face, zero.astype(rays.key.dtype), zero, way // count == 4)
+        texel, ray = divided(way, count)
+        return _Way(ray, face, zero.astype(rays.key.dtype), zero, texel == 4)
 
     def walk(way: _Way, goes: Array, fate: Array) -> tuple[_Way, Array, Array]:
         own = rays.face[way.ray]

@@ -18,7 +18,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int, Shaped
 
 from diffrast._device import anywhere, in_strides, lanes, over_views
-from diffrast._selection import over_batches, selected
+from diffrast._selection import divided, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, picked, walk
@@ -117,8 +117,9 @@ def _between_pixels(
     barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
 
     def look(number: Array, exists: Array, edges: Array) -> Array:
-        lamp, at = number // (2 * height * width), number % (height * width)
-        next_at = at + jnp.where(number // (height * width) % 2 == 0, 1, width)
+        pair, at = divided(number, height * width)
+        lamp, is_below = divided(pair, 2)
+        next_at = at + jnp.where(is_below == 0, 1, width)
         is_lit = bright[lamp, at]
         ends = jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
         dark, bright_end = (Points(face[i], list(barycentrics[:, i]), at) for i in stored(ends))
