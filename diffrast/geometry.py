@@ -181,13 +181,16 @@ def _placed_derivative(
 ) -> tuple[Array, Any]:
     matrices, parts = primals
     placed = _placed_by(function, *primals)  # whose derivative, again, is this one
-    if all(isinstance(change, SymbolicZero) for change in tangents[1]):
+    changes = {k: t for k, t in enumerate(tangents[1]) if not isinstance(t, SymbolicZero)}
+    if not changes:
         return placed, SymbolicZero.from_primal_value(placed)
-    changes = [
-        jnp.zeros_like(part) if isinstance(change, SymbolicZero) else change
-        for part, change in zip(parts, tangents[1], strict=True)
-    ]
-    return placed, jax.jvp(partial(_in_world, function, matrices), (parts,), (changes,))[1]
+
+    def of_moving(*own: Array) -> Array:
+        moving = dict(zip(changes, own, strict=True))
+        return _in_world(function, matrices, [moving.get(k, part) for k, part in enumerate(parts)])
+
+    moving = tuple(parts[k] for k in changes)
+    return placed, jax.jvp(of_moving, moving, tuple(changes.values()))[1]
 
 
 def _shortened(matrix: Array, normals: Array) -> Array:

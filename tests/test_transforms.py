@@ -1,5 +1,7 @@
 """Every transformation of JAX on the renderer and on its edges: the same numbers, whichever way."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,6 +141,22 @@ def test_shard_map_of_scan_of_grad_by_transforms():
         objects = [dr.Object(MESH, None, dr.linalg.translation(offset)), dr.Object(cube)]
         scene = dr.Scene(objects=objects, lights=SCENE.lights)
         return jnp.mean(dr.render(scene, camera(EYES[0]), dr.RenderSettings(**SIZE)) ** 2)
+
+    of_all = sharded(lambda offsets: jax.lax.map(jax.grad(loss), offsets))
+    gradients = of_all(EYES[:2] / 4)
+    mapped = jax.jit(jax.vmap(jax.grad(loss)))(EYES[:2] / 4)
+    np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
+    assert np.all(np.any(gradients != 0, axis=1))
+
+
+def test_shard_map_of_grad_by_the_vertices_of_one_object():
+    cube = dr.mesh.flat_shaded(dr.shapes.cube())
+    settings = dr.RenderSettings(**SIZE, antialias=False)
+
+    def loss(offset):
+        moved = dataclasses.replace(MESH, vertices=MESH.vertices + offset)
+        scene = dr.Scene(objects=[dr.Object(moved), dr.Object(cube)], lights=SCENE.lights)
+        return jnp.mean(dr.render(scene, camera(EYES[0]), settings) ** 2)
 
     of_all = sharded(lambda offsets: jax.lax.map(jax.grad(loss), offsets))
     gradients = of_all(EYES[:2] / 4)
