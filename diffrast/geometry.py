@@ -73,14 +73,14 @@ def world_geometry(scene: Scene, shading: str) -> Geometry:
     """All objects in the world, with what this shading needs of them."""
     with jax.named_scope("geometry"):
         meshes = [item.mesh for item in scene.objects]
-        vertices, smooth = [mesh.vertices for mesh in meshes], shading in ("phong", "gouraud")
+        vertices = [mesh.vertices for mesh in meshes]
         transforms = jnp.stack([item.transform for item in scene.objects])
         object_of_face = _owner([mesh.faces for mesh in meshes])
         faces = _numbered([mesh.faces for mesh in meshes], vertices)
         mirrored = jax.vmap(mirrors)(transforms)
         turned_round = mirrored[object_of_face][:, None] if len(meshes) > 1 else mirrored
         normals = uvs = uv_faces = None
-        if smooth:
+        if shading in ("phong", "gouraud"):
             own = [_own_normals(mesh) for mesh in meshes]
             normals = stored_rows(_in_world(_turned, _turns(transforms), own))
         if any(mesh.uvs is not None for mesh in meshes):
@@ -145,6 +145,11 @@ def _turned(matrix: Array, normals: Array) -> Array:
     return normalize(apply_matrix(matrix, normals))
 
 
+def _known(values: Array) -> Array:
+    """Zeros in place of what is not finite: nothing shows it, but background looks at face 0."""
+    return jnp.where(jnp.isfinite(values), values, 0)
+
+
 def _own_normals(mesh: Mesh) -> Array:
     return vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
 
@@ -159,11 +164,11 @@ def _placed(scene: Scene, geometry: Geometry) -> Placed:
         turns = [normal_matrix(transform) for transform in transforms]
         own, matrices = [_own_normals(item.mesh) for item in scene.objects], _turns(matrices)
         attributes.append(_placed_by(_turned, matrices, own))
-        normals = stored_rows(_in_world(_shortened, matrices, own))
+        normals = stored_rows(_known(_in_world(_shortened, matrices, own)))
     return Placed(
         tuple(Placement(m[:3], turn) for m, turn in zip(transforms, turns, strict=True)),
         geometry.object_of_face,
-        stored_rows(where_finite(lambda points: points, jnp.concatenate(vertices))),
+        stored_rows(_known(jnp.concatenate(vertices))),
         normals,
         tuple(map(stored_rows, attributes)),
     )
@@ -226,9 +231,9 @@ def draw(
             width=width + 2 * border,
             cull_backfaces=cull_backfaces,
         )
-    attributes = [geometry.positions]
+    attributes = [_known(geometry.positions)]
     if geometry.normals is not None:
-        attributes.append(geometry.normals)
+        attributes.append(_known(geometry.normals))
     projection = placed = None
     if camera.distortion is None:
         matrix, pivot = pivoted_matrix(camera)
@@ -254,7 +259,8 @@ def visible_points(drawn: Drawn, face: Array) -> Points:
 
 def at_points(attribute: Array, geometry: Geometry, points: Points) -> Columns:
     """Values at the vertices, (V, C), interpolated at points."""
-    columns = [attribute[:, i] for i in range(attribute.shape[1])]
+    known = _known(attribute)
+    columns = [known[:, i] for i in range(known.shape[1])]
     # Not before the barycentrics are found: what these are made of need not be kept meanwhile.
     face = stored(points.face, points.barycentrics[0])
     return interpolate_columns(columns, geometry.faces, face, points.barycentrics)
@@ -285,7 +291,7 @@ def uvs_at(geometry: Geometry, points: Points) -> Columns:
 
 def flat_normals(geometry: Geometry, face: Array) -> Columns:
     """Unit normals of faces."""
-    normals = face_normals(geometry.positions, geometry.faces_outward)
+    normals = face_normals(_known(geometry.positions), geometry.faces_outward)
     visible = jnp.maximum(face, 0)
     return [normals[:, i][visible] for i in range(3)]
 

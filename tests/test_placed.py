@@ -118,6 +118,25 @@ def test_objects_that_do_not_move_have_no_part(by_vertices, moving):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
 
 
+@pytest.mark.parametrize("amount", [0.0, np.nan])
+def test_what_is_out_of_sight_spoils_nothing(amount):
+    """An object behind the camera whose place has an infinite derivative, or is none."""
+
+    def of_all(offsets):
+        behind = 20 + jnp.sqrt(amount * offsets[2, 2])
+        last = dr.linalg.translation(jnp.stack([offsets[2, 0], offsets[2, 1], behind]))
+        transforms = [*map(dr.linalg.translation, offsets[:2]), last]
+        return jnp.sum(picture(START | {"transforms": transforms}) ** 2)
+
+    offsets = jnp.array([[-0.8, 0.1, 0.0], [0.9, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    loss, change = jax.jit(lambda: jax.jvp(of_all, (offsets,), (jnp.ones((3, 3)),)))()
+    gradient = jax.jit(jax.grad(of_all))(offsets)[:2]
+    assert loss > 0
+    assert np.isfinite(change)
+    assert np.isfinite(gradient).all()
+    assert np.all(np.any(gradient != 0, axis=1))
+
+
 def test_derivatives_are_those_of_the_picture(by_vertices):
     (start, way, _), _ = by_vertices
     still = jnp.zeros((4, 4))  # the flat sheet would turn over

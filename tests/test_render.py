@@ -323,6 +323,32 @@ def test_vertices_of_no_face_may_hold_anything(shading):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
 
 
+@pytest.mark.parametrize("shading", ["phong", "gouraud", "flat"])
+@pytest.mark.parametrize("number", [0, 50])
+def test_faces_whose_vertices_are_not_finite_are_left_out(shading, number):
+    """Also the first one, at which the background looks: the derivatives are those without it."""
+    scene, camera = scenes.one_object(), scenes.perspective()
+    item, weights = scene.objects[0], jnp.asarray(NOISE)
+    own = np.asarray(item.mesh.faces)
+    lost = own[number, 0]
+
+    def gradient(vertices, faces):
+        def loss(vertices, transform, camera, lights):
+            mesh = dr.Mesh(vertices=vertices, faces=faces, normals=item.mesh.normals)
+            item_there = dr.Object(mesh, item.material, transform)
+            moved = replace(scene, objects=[item_there], lights=lights)
+            return jnp.vdot(weights, dr.render(moved, camera, settings(shading=shading)))
+
+        of_all = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
+        return of_all(vertices, item.transform, camera, scene.lights)
+
+    got = gradient(item.mesh.vertices.at[lost].set(jnp.nan), own)
+    want = gradient(item.mesh.vertices, own[~np.any(own == lost, axis=1)])
+    for one, other in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        assert np.isfinite(one).all()
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
 # ------------------------------------------------------------------------------- only what is used
 
 

@@ -267,14 +267,17 @@ def _moved(
         known = {k: m for k, m in enumerate(matrices) if not isinstance(m, SymbolicZero)}
         if not known:
             return None
-        number = np.array(list(known)).reshape(-1, *[1] * pixels.face.ndim)
+        number = np.array(list(known), np.int32).reshape(-1, *[1] * pixels.face.ndim)
         here = covered & (object_of == number)
         if len(known) == 1:
-            change = [jnp.where(here[0], part, 0) for part in change_by(*known.values())]
-        else:  # as a product, whose transpose sums over the picture for all of them at once
-            shares = stored(here.astype(seen.inverse_depth.dtype))
-            matrix = jnp.stack(list(known.values()), axis=-1)
-            change = change_by(jnp.tensordot(matrix, shares, 1, precision=lax.Precision.HIGHEST))
+            (matrix,), (moves,) = known.values(), here
+        else:  # a product, whose transpose sums over the picture for all of them at once
+            shares, moves = stored(here.astype(seen.inverse_depth.dtype)), covered
+            every = jnp.stack(list(known.values()), axis=-1)
+            # Of what is out of sight the change may be no number.
+            every = jnp.where(jnp.any(here.reshape(len(known), -1), axis=1), every, 0)
+            matrix = jnp.tensordot(every, shares, 1, precision=lax.Precision.HIGHEST)
+        change = [jnp.where(moves, part, 0) for part in change_by(matrix)]
         return stored(change, seen.inverse_depth)
 
     (at_corners,) = _at_corners((placed.positions,), seen)
