@@ -25,6 +25,7 @@ from diffrast._device import draws_on_cpu
 T = TypeVar("T")
 
 _SMALL = 4096  # numbers of an array; larger ones are better written side by side, by several cores
+_TOGETHER = 8  # arrays in one pass: of more than some thirty no loop is vectorised
 
 
 def stored(values: T, witness: Array | None = None) -> T:
@@ -67,7 +68,11 @@ def _groups(leaves: list[Array]) -> list[list[int]]:
         key = leaf.shape, leaf.dtype if own else precision.get(leaf.shape)
         alone = leaf.size > _SMALL or not draws_on_cpu()
         groups.setdefault(i if alone else key, []).append(i)
-    return list(groups.values())
+    return [
+        group[first : first + _TOGETHER]
+        for group in groups.values()
+        for first in range(0, len(group), _TOGETHER)
+    ]
 
 
 def _one(witness: Array, dtype: jnp.dtype) -> Array:

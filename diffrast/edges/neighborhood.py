@@ -8,7 +8,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, at_once, in_strides, views_fill_lanes
-from diffrast._selection import compacted, over_batches
+from diffrast._selection import compacted, divided, over_batches
 from diffrast._stored import stored, stored_together
 from diffrast._topology import by_three
 from diffrast.edges.planes import Table, corners_of, covers, edge_values
@@ -50,19 +50,21 @@ def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) 
     return image[row + down, column + right]
 
 
-def blocks_with_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
-    """Whether blocks of pixels hold an empty one, with a border of one block all round."""
+def near_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
+    """Whether blocks of pixels, or those round them, hold an empty one."""
     height, width = face_image.shape
     bare = jnp.pad(face_image < 0, ((0, -height % _BLOCK), (0, -width % _BLOCK)))
     rows = jnp.any(bare.reshape(-1, _BLOCK, bare.shape[1]), axis=1)
-    return jnp.pad(jnp.any(rows.reshape(rows.shape[0], -1, _BLOCK), axis=2), 1)
+    blocks = jnp.pad(jnp.any(rows.reshape(rows.shape[0], -1, _BLOCK), axis=2), 1)
+    near = blocks[:-2] | blocks[1:-1] | blocks[2:]
+    return near[:, :-2] | near[:, 1:-1] | near[:, 2:]
 
 
-def is_bare_near(
-    blocks: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
+def is_near_background(
+    near: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
 ) -> Bool[Array, " n"]:
-    """Whether one of the 3×3 blocks round pixels of an image with a border holds an empty one."""
-    return jnp.any(pixels_round(blocks, (column + 1) // _BLOCK, (row + 1) // _BLOCK), axis=0)
+    """Whether the blocks round pixels hold an empty one, which have a border in that image."""
+    return near[divided(row + 1, _BLOCK)[0], divided(column + 1, _BLOCK)[0]]
 
 
 def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "12 n"]:

@@ -129,7 +129,7 @@ def cross(
     reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
     near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
     body = stored(jnp.where(near, planes.body, -1))
-    value, across, down = (part[:, None] - part for part in stored(jnp.sum(planes.lambdas, axis=1)))
+    value, across, down = (part[:, None] - part for part in stored(_planes(planes.lambdas)))
     meet = abs(value) <= 0.5 * (abs(across) + abs(down))
     differ = (body[:, None] != body) & (body[:, None] >= 0) & (body >= 0)
     # Of small faces only the two that were found to meet.
@@ -156,7 +156,7 @@ def _candidates(
     face = pictured[nearest_first]
     body = _body_of(face, topology.bodies)
     of_seen = _lambdas(pixel, face, faces, pixels)
-    seen_planes = stored(jnp.sum(of_seen[0], axis=1))
+    seen_planes = stored(_planes(of_seen[0]))
     rows = stored(jnp.stack(_two_bodies(body, seen_planes)))
     pair = jnp.stack([picked(face, row) for row in rows])
     differ = picked(body, rows[0]) != picked(body, rows[1])
@@ -178,7 +178,7 @@ def _candidates(
         face[:, None] == jnp.where(jnp.tri(_FACES, k=-1)[..., None] > 0, face, -1), axis=1
     )
     known = (face >= 0) & (volume != 0) & jnp.isfinite(volume) & ~again
-    total = jnp.sum(lambdas[0], axis=0)
+    total = _added(lambdas[0])
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
     face, lambdas, fine = stored_together((face, lambdas * unit, size < _FINE))
@@ -235,8 +235,9 @@ def _meeting(
         reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
         now = there & (reached >= 0)
         reached = stored(jnp.where(now, reached, pair))
-        following = meet(jnp.sum(_lambdas(pixel, reached, faces, pixels)[0], axis=1))
-        close = jnp.sum((following - point) ** 2, axis=0) < _CLOSE**2
+        following = meet(_planes(_lambdas(pixel, reached, faces, pixels)[0]))
+        x, y = following - point
+        close = x * x + y * y < _CLOSE**2
         met = met | (searched & jnp.all(arrived & now, axis=0) & close)
         # Else the next walks would be these again.
         changes = jnp.any((reached != pair) | (now != arrived), axis=0)
@@ -267,6 +268,16 @@ def _lambdas(pixel: Array, face: Array, faces: Array, pixels: Table) -> tuple[Ar
     across = jnp.stack([w[j] * v[i] - w[i] * v[j] for i, j in turns])
     down = jnp.stack([u[j] * w[i] - u[i] * w[j] for i, j in turns])
     return jnp.stack([at_centre, across, down]) * inverse, volume, area(corners)
+
+
+def _added(corners: Array) -> Array:
+    """The sum over three corners. XLA makes a slow pass of its own of a reduction."""
+    return corners[0] + corners[1] + corners[2]
+
+
+def _planes(lambdas: Array) -> Array:
+    """1/w and its slopes, (3, ...), of λ and its slopes."""
+    return _added(lambdas.swapaxes(0, 1))
 
 
 def _line(difference: Array) -> tuple[Array, Array, Array]:
@@ -305,7 +316,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     which = jnp.stack([one, other])[None, None]
     at = jnp.take_along_axis(planes.lambdas, which, axis=2, mode="promise_in_bounds")
     at = stored(at)  # (3, 3 corners, 2 faces, n)
-    sums = jnp.sum(at, axis=1)  # 1/w and its slopes, of both faces
+    sums = _planes(at)  # 1/w and its slopes, of both faces
     point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))
     point = _kept_aside(point, normal, whole, bodies, planes.body[_CENTRE])
     along = _left_of(normal)
@@ -320,7 +331,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     begin, end = point + first * along, point + last * along
     x, y = stored((begin + end) / 2)
     values = at[0] + x * at[1] + y * at[2]  # (3 corners, 2 faces, n)
-    depth = jnp.sum(values, axis=0)
+    depth = _added(values)
 
     # Both reach to both sides.
     aside = _THROUGH * (at[1] * normal[0] + at[2] * normal[1])
@@ -335,7 +346,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
     in_front = values + aside * jnp.array([[1], [-1]])
     in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
-    total = jnp.sum(in_front, axis=0)
+    total = _added(in_front)
 
     centre = pixel.astype(depth.dtype) + 0.5
     plane = jnp.stack(
@@ -373,4 +384,4 @@ def _hidden(planes: _Planes, others: Array, x: Array, y: Array, depth: Array) ->
     """Whether one of these faces is before the point (x, y), whose 1/w is `depth`."""
     values = planes.lambdas[0] + x * planes.lambdas[1] + y * planes.lambdas[2]
     covers = jnp.all(values >= 0, axis=0) & planes.known & others
-    return jnp.any(covers & (jnp.sum(values, axis=0) > depth * (1 + TOLERANCE)), axis=0)
+    return jnp.any(covers & (_added(values) > depth * (1 + TOLERANCE)), axis=0)

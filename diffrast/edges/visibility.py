@@ -19,7 +19,7 @@ from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
 from diffrast.edges.neighborhood import (
     first_row,
-    is_bare_near,
+    is_near_background,
     only,
     picked,
     pixel_at,
@@ -130,12 +130,12 @@ def look(
     topology: Topology,
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
-    bare_blocks: Bool[Array, "rows columns"],
+    near_bare: Bool[Array, "rows columns"],
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `bare_blocks` are those of `blocks_with_background`.
+    one pixel all round; `near_bare` is its `near_background`.
     """
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
@@ -290,18 +290,22 @@ def look(
         (jnp.where(visible, ways, -1), (centre + middle)[:, None] + away)
     )
     reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
-    arrives = stored(there & (reached >= 0))
+    arrives = there & (reached >= 0)
     reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
     in_front = reached_depth > near * (1 + FINE_TOLERANCE)
     touches = ~in_front[3:] & (reached_depth[3:] > near * (1 - FINE_TOLERANCE))
     connected = plain | (arrives[3:] & (touches | (reached[3:] == front)))
     connected = connected & alike & ~hidden
     hides = arrives[:3] & (reached[:3] != own[0]) & (reached[:3] != own[1]) & in_front[:3]
-    visible = visible & ~jnp.any(hides[:2], axis=0)
+    visible = visible & ~hides[0] & ~hides[1]
     lies = search & arrives[1:3] & ~hides[1:] & (reached_depth[1:3] > least)
     nearer_lies = lies & (reached_depth[1:3] >= jnp.where(lies, reached_depth[1:3], 0)[::-1])
     stops = search & ~found & there[1] & (reached[1] < 0) & (shown >= 0) & ~lies[1]
-    gap = stops & is_bare_near(bare_blocks, *pieces.pixel)
+    # Held: combined once more for each of their uses they are no vector code.
+    connected, lies, nearer_lies, visible, stops = stored_together(
+        (connected, lies, nearer_lies, visible, stops)
+    )
+    gap = stops & is_near_background(near_bare, *pieces.pixel)
     beyond = jnp.where(nearer_lies[0], reached[1], jnp.where(lies[1], reached[2], beyond))
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
     # On the edge itself rounding would decide whether a face that ends there shades it.
