@@ -50,7 +50,7 @@ class _Sight(NamedTuple):
     """What is known of rays from the keys alone."""
 
     line: Line
-    texels: Int[Array, "9 n"]  # numbers of the nine round each
+    faces: Int[Array, "9 n"]  # at the nine texels round each
     slopes: Float[Array, "2 n"]  # of the keys on the faces on which they begin
     before: Float[Array, "9 n"]  # by how much the nine texels show more than the faces' planes
 
@@ -113,7 +113,8 @@ def _sight(pictures: Pictures, geometry: Geometry, rays: Rays) -> _Sight:
     along_row = slopes[0] * (texel.x - (nine % 3 - 1))
     along_column = slopes[1] * (texel.y - (nine // 3 - 1))
     before = (key - rays.key) + along_row + along_column - _rounding(rays)
-    return _Sight(line_of(pictures, rays, own), texels, jnp.stack(slopes), before)
+    faces = at_texels(pictures.face, texels)
+    return _Sight(line_of(pictures, rays, own), faces, jnp.stack(slopes), before)
 
 
 def _hidden(
@@ -136,7 +137,7 @@ def _hidden(
     at_once = lanes() * _WAYS_AT_ONCE
 
     def begin(way: Array) -> _Way:
-        face = at_texels(pictures.face, stored(sight.texels.reshape(-1)[way]))
+        face = sight.faces.reshape(-1)[way]
         zero = jnp.zeros_like(way)
         texel, ray = divided(way, count)
         return _Way(ray, face, zero.astype(rays.key.dtype), zero, texel == 4)
@@ -186,7 +187,7 @@ def _is_hidden_by_small(
     margin for surfaces that curve from one to the other.
     """
     texel = texel_of(pictures, rays)
-    faces = at_texels(pictures.face, sight.texels)
+    faces = sight.faces
     slopes, area = _slopes(pictures, rays, face_corners(geometry, faces[4]))
     margin = jnp.abs((slopes[0] - sight.slopes[0]) * texel.x)
     margin = margin + jnp.abs((slopes[1] - sight.slopes[1]) * texel.y)

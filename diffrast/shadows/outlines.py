@@ -292,7 +292,7 @@ def _leaves(
     (first, volume), (last, _) = (edge_functions(corners, *end) for end in ends)
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     extent = jnp.maximum(largest(one), largest(other))
-    place = jnp.max(jnp.abs(corners), axis=1)
+    place = largest(corners.swapaxes(0, 1))
     size = jnp.maximum(place[0], place[1]) * place[2] * extent
     volume = jnp.where(abs(volume) > _EDGE_ON * jnp.finfo(size.dtype).eps * size, volume, 0)
     sign = jnp.where(volume < 0, -1, 1)
