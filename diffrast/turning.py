@@ -333,9 +333,11 @@ def _of_parts(
     right, down = jnp.asarray(_POINTS)[:, :, parts.points]
     x, y = pixels.x + 2 * right, pixels.y - 2 * down
     flat, x, y = stored_together([part.reshape(-1) for part in (face, x, y)])
+    # Stored, and the colours: in what repeats rows no loop is vectorised.
     lit = jax.tree.map(lambda part: jnp.tile(part[parts.place], face.shape[0]), points.reached)
+    lit = stored(lit)
     seen = points_at(drawn, pixels._replace(face=flat, x=x, y=y))
-    colors = [color.reshape(face.shape) for color in shade(data, seen, lit)]
+    colors = [color.reshape(face.shape) for color in stored(shade(data, seen, lit))]
     used = (face[1:] >= 0) & parts.exists
     quarter = jnp.array(0.25, x.dtype)
     share = jnp.where(parts.points > 0, quarter, 1)  # of the pixel

@@ -281,7 +281,7 @@ def look(
     least_share = lowest(barycentrics([value[1] for value in values]))[0]
     hidden = (least_share > FINE_TOLERANCE) & (ours != front)
     planes = jnp.stack([picked(depths, look) for look in looks]) - near
-    plain = (ours == front) | jnp.any(nearby[:, None] == ours, axis=0)
+    plain = (ours == front) | jnp.any(around[9:, None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
 
     ways = jnp.stack([hiding, behind, other_behind, *jnp.where(alike & ~plain, ours, -1)])
