@@ -25,7 +25,7 @@ from diffrast._device import draws_on_cpu
 T = TypeVar("T")
 
 _SMALL = 4096  # numbers of an array; larger ones are better written side by side, by several cores
-_TOGETHER = 8  # arrays in one pass: of more than some thirty no loop is vectorised
+_TOGETHER = 8  # arrays in one pass; more take longer each, and some thirty are no vector code
 
 
 def stored(values: T, witness: Array | None = None) -> T:

@@ -124,7 +124,7 @@ def _edges(
     edges = view.topology.edges
     order, count = choose_edges(edges, volume, view.apart)
     z = stored(view.positions_clip[:, 2])
-    bare_near = near_background(view.face_image)
+    near_bare = near_background(view.face_image)
     at_once = usual_batches(view.apart.size, height * width)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
@@ -155,7 +155,7 @@ def _edges(
                 view.topology,
                 volume,
                 view.face_image,
-                bare_near,
+                near_bare,
             )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total

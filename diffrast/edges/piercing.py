@@ -129,7 +129,7 @@ def cross(
     reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
     near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
     body = stored(jnp.where(near, planes.body, -1))
-    value, across, down = (part[:, None] - part for part in stored(_planes(planes.lambdas)))
+    value, across, down = (part[:, None] - part for part in stored(_sums(planes.lambdas)))
     meet = abs(value) <= 0.5 * (abs(across) + abs(down))
     differ = (body[:, None] != body) & (body[:, None] >= 0) & (body >= 0)
     # Of small faces only the two that were found to meet.
@@ -156,7 +156,7 @@ def _candidates(
     face = pictured[nearest_first]
     body = _body_of(face, topology.bodies)
     of_seen = _lambdas(pixel, face, faces, pixels)
-    seen_planes = stored(_planes(of_seen[0]))
+    seen_planes = stored(_sums(of_seen[0]))
     rows = stored(jnp.stack(_two_bodies(body, seen_planes)))
     pair = jnp.stack([picked(face, row) for row in rows])
     differ = picked(body, rows[0]) != picked(body, rows[1])
@@ -235,7 +235,7 @@ def _meeting(
         reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
         now = there & (reached >= 0)
         reached = stored(jnp.where(now, reached, pair))
-        following = meet(_planes(_lambdas(pixel, reached, faces, pixels)[0]))
+        following = meet(_sums(_lambdas(pixel, reached, faces, pixels)[0]))
         x, y = following - point
         close = x * x + y * y < _CLOSE**2
         met = met | (searched & jnp.all(arrived & now, axis=0) & close)
@@ -275,7 +275,7 @@ def _added(corners: Array) -> Array:
     return corners[0] + corners[1] + corners[2]
 
 
-def _planes(lambdas: Array) -> Array:
+def _sums(lambdas: Array) -> Array:
     """1/w and its slopes, (3, ...), of λ and its slopes."""
     return _added(lambdas.swapaxes(0, 1))
 
@@ -316,7 +316,7 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     which = jnp.stack([one, other])[None, None]
     at = jnp.take_along_axis(planes.lambdas, which, axis=2, mode="promise_in_bounds")
     at = stored(at)  # (3, 3 corners, 2 faces, n)
-    sums = _planes(at)  # 1/w and its slopes, of both faces
+    sums = _sums(at)  # 1/w and its slopes, of both faces
     point, normal, inverse = stored(_line(sums[:, 0] - sums[:, 1]))
     point = _kept_aside(point, normal, whole, bodies, planes.body[_CENTRE])
     along = _left_of(normal)
