@@ -205,10 +205,8 @@ def with_pieces(
     rim = found.rim
     looks = (found.front.look, found.beyond.look, rim.inner)
     places = [_place(view, pieces.pixel, look) for look in looks]
+    near, behind, inner = stored_together([_colors(view.image, place) for place in places])
     centre, bare = _place(view, pieces.pixel, 4), view.background
-    near, behind, inner, own = stored_together(
-        [_colors(view.image, place) for place in (*places, centre)]
-    )
     bare = bare[:, None] if bare.ndim == 1 else _colors(bare, centre)
     behind = jnp.where(found.beyond.face == BACKGROUND, bare, behind)
     front = near
@@ -229,6 +227,7 @@ def with_pieces(
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
         turn = length * (integral - _mean(rim.reaches) * near)
+        own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         if view.meaned is not None:
             meaned = stored(view.meaned.reshape(-1)[_number(view, pieces.pixel)])

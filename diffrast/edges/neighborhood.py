@@ -63,7 +63,7 @@ def near_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows
 def is_near_background(
     near: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
 ) -> Bool[Array, " n"]:
-    """Whether the blocks round pixels hold an empty one, which have a border in that image."""
+    """The same of pixels, counted without the border of one pixel that this image has."""
     return near[divided(row + 1, _BLOCK)[0], divided(column + 1, _BLOCK)[0]]
 
 

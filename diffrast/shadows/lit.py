@@ -47,10 +47,10 @@ _CLOSE = 8.0  # behind a smooth surface by less than so many half texels: what i
 
 
 class _Sight(NamedTuple):
-    """What is known of rays from the keys alone."""
+    """What is known of rays from the nine texels round each."""
 
     line: Line
-    faces: Int[Array, "9 n"]  # at the nine texels round each
+    faces: Int[Array, "9 n"]  # that these show
     slopes: Float[Array, "2 n"]  # of the keys on the faces on which they begin
     before: Float[Array, "9 n"]  # by how much the nine texels show more than the faces' planes
 
