@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.custom_derivatives import SymbolicZero
 
 
 def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
@@ -44,7 +45,26 @@ def linear_map(
     def transpose_solve(_: Any, b: tuple[Any, Array]) -> tuple[Any, Array]:
         return pull(b[1]), b[1]
 
+    changes = _all_changing(changes)
     # Of all changes, memory would be held longer.
     right = changes, nothing.at[0, 0].add(traces(jax.tree.leaves(changes)[0]))
     changes, out = lax.custom_linear_solve(lambda x: x, right, solve, transpose_solve)
     return out.at[0, 0].add(traces(changes))
+
+
+@jax.custom_jvp
+def _all_changing(changes: Any) -> Any:
+    """The same; of their derivatives JAX takes all or none, whatever is known to be zero."""
+    return changes
+
+
+def _all_change(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    leaves, tree = jax.tree.flatten(tangents[0])
+    one = next(leaf for leaf in leaves if not isinstance(leaf, SymbolicZero))
+    changes = [
+        linear_zeros(leaf.shape, one) if isinstance(leaf, SymbolicZero) else leaf for leaf in leaves
+    ]
+    return primals[0], jax.tree.unflatten(tree, changes)
+
+
+_all_changing.defjvp(_all_change, symbolic_zeros=True)

@@ -224,6 +224,22 @@ def test_drawings_are_differentiable_in_points_and_colors():
         )
 
 
+def test_second_derivatives_take_the_first_one_of_the_picture():
+    """Where a loss is least they are its square; that of the lines themselves is left out."""
+    points, way = jnp.array([[3.0, 4.0], [20.0, 13.5]]), jnp.array([[0.5, -1.0], [0.3, 0.7]])
+
+    def picture(points):
+        return dr.draw_lines(points, np.array([[0, 1]]), height=16, width=24)
+
+    target, change = jax.jvp(picture, (points,), (way,))
+
+    def loss(points):
+        return jnp.sum((picture(points) - target) ** 2) / 2
+
+    bend = jax.jvp(jax.grad(loss), (points,), (way,))[1]
+    np.testing.assert_allclose(jnp.vdot(bend, way), jnp.vdot(change, change), rtol=1e-5)
+
+
 def test_level_and_upright_lines_have_derivatives():
     # A pixel half covered changes by the length of the line in it, one at an end by the width.
     start, end = (jnp.array([p]) for p in ([2.5, 5.0], [8.5, 5.0]))

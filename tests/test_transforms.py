@@ -102,22 +102,28 @@ def test_both_precisions_in_one_process():
     assert shape().dtype == jnp.float32
 
 
+def seen(eye):
+    clip = dr.world_to_clip(camera(eye), MESH.vertices)
+    return dr.rasterize(clip, MESH.faces, border=1, **SIZE).face
+
+
+def with_edges(eye, face, **options):
+    """The stage alone: faces of one colour each, which changes with the eye."""
+    clip = dr.world_to_clip(camera(eye), MESH.vertices)
+    colors = 0.1 * eye + jnp.sin(jnp.arange(3.0 * len(MESH.faces))).reshape(-1, 3)
+    picture = jnp.where(face[..., None] >= 0, colors[face], 0.0)
+    return dr.antialias(
+        picture, clip, MESH.faces, face, topology=MESH.topology, creases="all",
+        data=colors, **options,
+    )  # fmt: skip
+
+
 def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
-    """On the stage alone: faces of one colour each, which changes with the eye."""
-
-    def seen(eye):
-        clip = dr.world_to_clip(camera(eye), MESH.vertices)
-        return dr.rasterize(clip, MESH.faces, border=1, **SIZE).face
-
     def loss(eye, face):
-        clip = dr.world_to_clip(camera(eye), MESH.vertices)
-        colors = 0.1 * eye + jnp.sin(jnp.arange(3.0 * len(MESH.faces))).reshape(-1, 3)
-        picture = jnp.where(face[..., None] >= 0, colors[face], 0.0)
-        with_edges = dr.antialias(
-            picture, clip, MESH.faces, face, topology=MESH.topology, creases="all",
-            shader=lambda colors, face, at: colors[face], data=colors,
-        )  # fmt: skip
-        return jnp.mean(with_edges**2)
+        def shader(colors, face, at):
+            return colors[face]
+
+        return jnp.mean(with_edges(eye, face, shader=shader) ** 2)
 
     def derivatives(none, view):  # the second one without that of what is visible
         eye, face = view
@@ -131,6 +137,33 @@ def test_edges_under_shard_map_of_scan_of_grad_and_of_hessian_vector_product():
     np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
     assert np.all(np.isfinite(products))
     assert np.all(np.any(products != 0, axis=1))
+
+
+def test_hessian_where_a_loss_is_least_is_the_product_of_first_derivatives_of_edges():
+    eye, other = EYES[2], jnp.array([2.0, -1.0, 0.5])
+    face = seen(eye)
+
+    @jax.jit
+    def products(eye):
+        target, change = jax.linearize(lambda eye: with_edges(eye, face), eye)
+
+        def loss(eye):
+            return jnp.sum((with_edges(eye, face) - target) ** 2) / 2
+
+        def forward(eye):
+            return jax.jvp(loss, (eye,), (TANGENT,))[1]
+
+        forward_of_reverse = jax.jvp(jax.grad(loss), (eye,), (TANGENT,))[1]
+        changes = jax.vmap(change)(jnp.stack([TANGENT, other]))
+        return (
+            jnp.vdot(*changes),
+            jnp.vdot(forward_of_reverse, other),
+            jnp.vdot(jax.grad(forward)(eye), other),
+        )
+
+    expected, *found = products(eye)
+    assert abs(expected) > 1
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 def test_shard_map_of_scan_of_grad_by_transforms():

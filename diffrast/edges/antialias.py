@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.custom_derivatives import SymbolicZero
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Float, Int
 
 from diffrast import _check
@@ -176,23 +176,39 @@ def antialias_image(
         now = rest._replace(image=image, positions_clip=positions_clip)
         return with_edges(image, gather(now, method._replace(capacity=0)).sums)
 
-    def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    @jax.custom_jvp
+    def recorded(image: Array, positions_clip: Array, rest: View) -> tuple[Array, Any]:
+        """The same, and what its derivative is made of."""
+        now = rest._replace(image=image, positions_clip=positions_clip)
+        records, sums = gather(now, method)
+        assert sums is not None
+        return with_edges(image, sums), (records, sums.rims, sums.unseen)
+
+    def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, rest = primals
         d_image, d_clip = tangents[:2]
         if isinstance(d_image, SymbolicZero):
             d_image = linear_zeros(image.shape, d_clip)
         if isinstance(d_clip, SymbolicZero):
             d_clip = linear_zeros(positions_clip.shape, d_image)
-        now = lax.stop_gradient(rest._replace(image=image, positions_clip=positions_clip))
-        records, sums = gather(now, method)
-        assert records is not None
-        assert sums is not None
-        assert sums.rims is not None
+        # With a derivative of its own: a second one takes the first one of the picture, too.
+        out, made_of = recorded(image, positions_clip, rest)
+        now = rest._replace(image=image, positions_clip=positions_clip)
+        now, (records, rims, unseen) = lax.stop_gradient((now, made_of))
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels)
-        now = now._replace(unseen=sums.unseen)
-        d_out = apply_linear(now, method, records, sums.rims, points, colors)
-        return with_edges(image, sums), d_out.reshape(height, width, channels)
+        now = now._replace(unseen=unseen)
+        d_out = apply_linear(now, method, records, rims, points, colors)
+        return (out, made_of), d_out.reshape(height, width, channels)
 
-    blended.defjvp(derivative, symbolic_zeros=True)
+    def of_picture(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        (out, _), d_out = derivative(primals, tangents)
+        return out, d_out
+
+    def of_recorded(primals: Any, tangents: Any) -> tuple[Any, Any]:
+        out, d_out = derivative(primals, tangents)
+        return out, (d_out, jax.tree.map(zero_from_primal, out[1]))
+
+    blended.defjvp(of_picture, symbolic_zeros=True)
+    recorded.defjvp(of_recorded, symbolic_zeros=True)
     return blended(view.image, view.positions_clip, lax.stop_gradient(view))

@@ -108,8 +108,7 @@ def add_lines(
             d_ends = linear_zeros(ends.shape, d_values)
         if isinstance(d_values, SymbolicZero):
             d_values = linear_zeros(values.shape, d_ends)
-        out = total(ends, values, rest)
-        return out, _apply_linear(frame, (ends, values, rest), d_ends, d_values)
+        return total(*primals), _apply_linear(frame, (ends, values, rest), d_ends, d_values)
 
     total.defjvp(derivative, symbolic_zeros=True)
     ends = jnp.concatenate([segments.start, segments.end], axis=1)
