@@ -4,17 +4,29 @@ JAX transposes no loop whose length is known only when it runs.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
+T = TypeVar("T")
+
 
 def linear_zeros(shape: tuple[int, ...], tangent: Array) -> Array:
     """Zeros that depend on a tangent: derivatives leave out what is known not to."""
     return jnp.broadcast_to(tangent.reshape(-1)[0] * 0, shape)
+
+
+def without_known_zeros(changes: T) -> T:
+    """A tree of tangents, of which some are not known to be zero, in which then none is."""
+    leaves, tree = jax.tree.flatten(changes)
+    one = next(leaf for leaf in leaves if not isinstance(leaf, SymbolicZero))
+    filled = [
+        linear_zeros(leaf.shape, one) if isinstance(leaf, SymbolicZero) else leaf for leaf in leaves
+    ]
+    return jax.tree.unflatten(tree, filled)
 
 
 def linear_map(
@@ -58,13 +70,6 @@ def _all_changing(changes: Any) -> Any:
     return changes
 
 
-def _all_change(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
-    leaves, tree = jax.tree.flatten(tangents[0])
-    one = next(leaf for leaf in leaves if not isinstance(leaf, SymbolicZero))
-    changes = [
-        linear_zeros(leaf.shape, one) if isinstance(leaf, SymbolicZero) else leaf for leaf in leaves
-    ]
-    return primals[0], jax.tree.unflatten(tree, changes)
-
-
-_all_changing.defjvp(_all_change, symbolic_zeros=True)
+_all_changing.defjvp(
+    lambda primals, tangents: (primals[0], without_known_zeros(tangents[0])), symbolic_zeros=True
+)

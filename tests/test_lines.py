@@ -240,6 +240,21 @@ def test_second_derivatives_take_the_first_one_of_the_picture():
     np.testing.assert_allclose(jnp.vdot(bend, way), jnp.vdot(change, change), rtol=1e-5)
 
 
+def test_second_derivatives_are_the_same_where_only_the_points_have_one():
+    def loss(t):
+        points = jnp.array([[3.0, 4.0], [20.0, 13.5]]) + jnp.sin(t)
+        lines, colors = np.array([[0, 1]]), t * jnp.ones((1, 3))
+        return jnp.sum(dr.draw_lines(points, lines, colors, height=16, width=24) ** 2)
+
+    def slope(t):
+        return jax.jvp(loss, (t,), (1.0,))[1]
+
+    t = jnp.float32(0.4)
+    bend = jax.jvp(jax.grad(loss), (t,), (1.0,))[1]
+    np.testing.assert_allclose(jax.jvp(slope, (t,), (1.0,))[1], bend, rtol=1e-5)
+    np.testing.assert_allclose(jax.grad(slope)(t), bend, rtol=1e-5)
+
+
 def test_level_and_upright_lines_have_derivatives():
     # A pixel half covered changes by the length of the line in it, one at an end by the width.
     start, end = (jnp.array([p]) for p in ([2.5, 5.0], [8.5, 5.0]))

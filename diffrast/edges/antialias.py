@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jax.custom_derivatives import zero_from_primal
 from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._device import over_views
-from diffrast._linear import linear_zeros
+from diffrast._linear import without_known_zeros
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
 from diffrast.edges.collect import collect
@@ -186,11 +186,7 @@ def antialias_image(
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, rest = primals
-        d_image, d_clip = tangents[:2]
-        if isinstance(d_image, SymbolicZero):
-            d_image = linear_zeros(image.shape, d_clip)
-        if isinstance(d_clip, SymbolicZero):
-            d_clip = linear_zeros(positions_clip.shape, d_image)
+        d_image, d_clip = without_known_zeros(tangents[:2])
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(image, positions_clip, rest)
         now = rest._replace(image=image, positions_clip=positions_clip)

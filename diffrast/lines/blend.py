@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Bool, Float, Int
 
+from diffrast._linear import linear_map, linear_zeros, without_known_zeros
 from diffrast._selection import batches_of
-from diffrast.edges.derivative import linear_zeros
 from diffrast.lines.hidden import Surface, hides
 from diffrast.lines.overlap import coverage
 from diffrast.lines.pixels import (
@@ -70,9 +69,6 @@ class Frame(NamedTuple):
         return math.ceil(math.sqrt(2) * self.line_width + 1 + 2 * _SLACK) + 1
 
 
-Parts = tuple[Array, Array, Array]  # ends, values and image
-
-
 class Terms(NamedTuple):
     """Lines and pixels that belong together."""
 
@@ -103,11 +99,7 @@ def add_lines(
 
     def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
         ends, values, rest = lax.stop_gradient(primals)
-        d_ends, d_values = tangents[:2]
-        if isinstance(d_ends, SymbolicZero):
-            d_ends = linear_zeros(ends.shape, d_values)
-        if isinstance(d_values, SymbolicZero):
-            d_values = linear_zeros(values.shape, d_ends)
+        d_ends, d_values = without_known_zeros(tangents[:2])
         return total(*primals), _apply_linear(frame, (ends, values, rest), d_ends, d_values)
 
     total.defjvp(derivative, symbolic_zeros=True)
@@ -168,23 +160,16 @@ def _pull(
 def _apply_linear(
     frame: Frame, at: tuple[Array, Array, Any], d_ends: Array, d_values: Array
 ) -> Array:
-    """`_push`, written as a linear system so that JAX knows both directions."""
-    one_by_one = jax.custom_batching.sequential_vmap
-
-    def matvec(x: Parts) -> Parts:
-        return x
-
-    def solve(_: Any, b: Parts) -> Parts:
-        return b[0], b[1], b[2] + one_by_one(partial(_push, frame))(*at, b[0], b[1])
-
-    def transpose_solve(_: Any, b: Parts) -> Parts:
-        ends, values = one_by_one(partial(_pull, frame))(*at, b[2])
-        return b[0] + ends, b[1] + values, b[2]
-
-    nothing = linear_zeros((frame.pixels, d_values.shape[1]), d_values)
-    right = d_ends, d_values, nothing
-    d_ends, d_values, out = lax.custom_linear_solve(matvec, right, solve, transpose_solve)
-    return out + linear_zeros(out.shape, d_ends) + linear_zeros(out.shape, d_values)
+    """`_push`, of which JAX knows both directions."""
+    push, pull = (
+        jax.custom_batching.sequential_vmap(partial(way, frame)) for way in (_push, _pull)
+    )
+    return linear_map(
+        lambda changes, nothing: nothing + push(*at, *changes),
+        lambda cotangent: pull(*at, cotangent),
+        (d_ends, d_values),
+        jnp.zeros((frame.pixels, d_values.shape[1]), d_values.dtype),
+    )
 
 
 # Bands --------------------------------------------------------------------------------------------
