@@ -46,6 +46,14 @@ def test_all_at_once_sees_what_one_by_one_sees(name, cull_backfaces):
 
 
 @pytest.mark.parametrize("name", SCENES)
+def test_all_at_once_in_double_precision(name):
+    """Indices have 32 bits all the same: scatters warn where what they add has more."""
+    with jax.enable_x64(True):
+        positions_clip, faces = clip_of(name)
+        assert_same(np.float64(positions_clip), faces, height=20, width=20, cull_backfaces=False)
+
+
+@pytest.mark.parametrize("name", SCENES)
 def test_faces_that_are_few_for_the_picture_are_drawn_in_larger_blocks(name):
     size = 192
     assert FACES * min(all_at_once._BLOCKS) ** 2 < size**2

@@ -125,7 +125,7 @@ def _draw_views(
     blocks_at_once = min(1 << (usual - 1).bit_length(), _PIXELS_AT_ONCE // side**2)
 
     def draw_faces(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        number = n * faces_at_once + jnp.arange(faces_at_once)
+        number = n * faces_at_once + jnp.arange(faces_at_once, dtype=jnp.int32)
         view, face = jnp.divmod(jnp.minimum(number, views * face_count - 1), face_count)
         corners = faces[view if faces.shape[0] > 1 else 0, face]
         corners = stored(corners + (view * vertex_count)[:, None])
@@ -139,7 +139,7 @@ def _draw_views(
         starts = ends - blocks
 
         def draw_blocks(m: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            block = m * blocks_at_once + jnp.arange(blocks_at_once)
+            block = m * blocks_at_once + jnp.arange(blocks_at_once, dtype=jnp.int32)
             owner = jnp.searchsorted(ends, block, side="right", method="scan_unrolled")
             owner = stored(jnp.minimum(owner, faces_at_once - 1))
             inside, place, key = _pixels(some, owner, block - starts[owner], image, side)
@@ -171,7 +171,7 @@ def _ready(
     side: int,
 ) -> tuple[_Faces, Int[Array, " F"]]:
     """Faces, and of how many blocks of so many rows and columns they are."""
-    sweep = set_up(corners_of(vertices, corners, jnp.arange(rank.size)), image, cull_backfaces)
+    sweep = set_up(corners_of(vertices, corners, jnp.arange(rank.size, dtype=jnp.int32)), image, cull_backfaces)
     (column, last_column), (row, last_row) = sweep.columns, sweep.rows
     small = classes < LARGE
     drawn = (classes < CULLED) & (column <= last_column) & (row <= last_row)
@@ -216,7 +216,8 @@ def _pixels(
     def spread(x: Array) -> Array:
         return x[:, None, None]
 
-    rows, columns = jnp.arange(side)[:, None], jnp.arange(side)
+    columns = jnp.arange(side, dtype=jnp.int32)
+    rows = columns[:, None]
     outside = jnp.zeros((), jnp.int32)
     for start, edge in zip(starts, each_edge(own.edges), strict=True):
         outside = outside | (spread(start) + spread(edge.a) * columns + spread(edge.b) * rows)
