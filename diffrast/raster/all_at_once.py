@@ -171,7 +171,8 @@ def _ready(
     side: int,
 ) -> tuple[_Faces, Int[Array, " F"]]:
     """Faces, and of how many blocks of so many rows and columns they are."""
-    sweep = set_up(corners_of(vertices, corners, jnp.arange(rank.size, dtype=jnp.int32)), image, cull_backfaces)
+    number = jnp.arange(rank.size, dtype=jnp.int32)
+    sweep = set_up(corners_of(vertices, corners, number), image, cull_backfaces)
     (column, last_column), (row, last_row) = sweep.columns, sweep.rows
     small = classes < LARGE
     drawn = (classes < CULLED) & (column <= last_column) & (row <= last_row)
