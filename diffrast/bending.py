@@ -74,7 +74,8 @@ def find_turning(
         def are_many(least: Array) -> Array:
             return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
 
-        return mean, bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
+        many = bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
+        return mean, stored(many.astype(jnp.int8)) > 0  # else the numbers would be held
 
     seen = lax.stop_gradient((face_image, hard))
     return Turning(*seen, *over_views(find, face_image.size)(*seen))

@@ -72,7 +72,7 @@ def shade_covered(
             over it for every batch.
         drawn: what is drawn.
         face: that each pixel sees, -1 for none.
-        reached: by each light; images.
+        reached: by each light, 1 or 0; images.
         background: numbers or images.
         in_batches: whether large images, or their derivatives, may be.
         points: what the pixels see, if that is known: without attributes and without a derivative.
@@ -137,7 +137,8 @@ def _before_background(colors: Columns, inputs: _Inputs) -> Columns:
 def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
     data, drawn, face, reached = inputs[:4]
     runs, seen = _covered_runs(face), face.reshape(-1)
-    parts = tuple(None if part is None else _taken(_in_runs(part, 0), runs) for part in reached)
+    # Held for the reverse pass: a byte each.
+    parts = jax.tree.map(lambda part: _taken(_in_runs(part > 0, False), runs), reached)
     # What vertices move is collected by faces: of few in every batch, of many in one go.
     many = drawn.faces.shape[0] > RUN * RUNS_AT_ONCE
     drawn = drawn._replace(scaled=scaled(drawn.positions_clip))
@@ -156,6 +157,7 @@ def _in_batches(shade: Shade, inputs: _Inputs) -> Columns:
 
     def shade_batch(batch: Any) -> Columns:
         _, chosen, carried, reached = batch
+        reached = jax.tree.map(lambda part: part.astype(dtype), reached)
         return shade(data, points_at(drawn, pixels_of(chosen), carried), reached)
 
     def no_colors(batch: Any) -> Columns:

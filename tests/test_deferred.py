@@ -16,7 +16,7 @@ HEIGHT, WIDTH = 24, 37  # no multiple of a run
 MESH = dr.shapes.icosphere(1)
 RNG = np.random.default_rng(0)
 WEIGHTS = jnp.asarray(RNG.normal(size=(3, HEIGHT, WIDTH)), jnp.float32)
-LIT = jnp.asarray(RNG.uniform(size=(HEIGHT, WIDTH)), jnp.float32)
+LIT = jnp.asarray(RNG.uniform(size=(HEIGHT, WIDTH)) < 0.6, jnp.float32)
 VIEWS = jax.sharding.PartitionSpec("views")
 START = {
     "eye": jnp.array([0.5, 0.4, 4.0]),

@@ -15,7 +15,7 @@ from diffrast._check import ArrayInput
 from diffrast._device import over_views
 from diffrast._linear import without_known_zeros
 from diffrast._topology import Topology, traced_topology
-from diffrast.edges.blend import Blended, Glow, Method, Shader, Sums, View
+from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
 from diffrast.edges.collect import collect
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
@@ -146,7 +146,7 @@ def antialias_image(
         cull_backfaces: whether only front faces are drawn.
     """
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
-    capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 8 / ROWS_AT_ONCE))
+    capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 10 / ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
@@ -164,17 +164,12 @@ def antialias_image(
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)
         return found
 
-    def with_edges(image: Array, sums: Sums | None) -> Array:
-        assert sums is not None
-        added, low, high = (
-            part.reshape(height, width, channels) for part in (sums.added, *sums.range)
-        )
-        return jnp.clip(image[1:-1, 1:-1] + added, low, high)
-
     @jax.custom_jvp
     def blended(image: Array, positions_clip: Array, rest: View) -> Array:
         now = rest._replace(image=image, positions_clip=positions_clip)
-        return with_edges(image, gather(now, method._replace(capacity=0)).sums)
+        _, sums = gather(now, method._replace(capacity=0))
+        assert sums is not None
+        return with_sums(image, sums)
 
     @jax.custom_jvp
     def recorded(image: Array, positions_clip: Array, rest: View) -> tuple[Array, Any]:
@@ -182,7 +177,7 @@ def antialias_image(
         now = rest._replace(image=image, positions_clip=positions_clip)
         records, sums = gather(now, method)
         assert sums is not None
-        return with_edges(image, sums), (records, sums.rims, sums.unseen)
+        return with_sums(image, sums, in_place=True), (records, sums.rims, sums.unseen)
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, rest = primals

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from diffrast._stored import stored, stored_together
+from diffrast._device import draws_on_cpu
+from diffrast._stored import stored, stored_together, zero_after
 from diffrast._topology import Topology, by_three
 from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
@@ -130,7 +131,7 @@ def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Ble
         rims = jnp.zeros(view.face_image.size, dtype) + zero
     if start is not None:
         return Blended(records, None)
-    own = cropped(view.image, view.image.shape)
+    own = cropped(view.image, view.image.shape) + zero
     unseen = None
     if view.topology.bodies is not None:
         unseen = jnp.full(own.shape[0], -1, view.face_image.dtype) + zero
@@ -316,6 +317,32 @@ def _with_values(
     low = low.at[number].min(stored(reduce(jnp.minimum, held)).T, mode="drop")
     high = high.at[number].max(stored(reduce(jnp.maximum, held)).T, mode="drop")
     return total._replace(added=added, range=(low, high)), number
+
+
+def with_sums(
+    image: Array, sums: Sums, *, in_place: bool = False
+) -> Float[Array, "height width channels"]:
+    """The image, of which a border is cut off, with what is added; no pixel beyond what it holds.
+
+    In place it is what is added that is written over: one more image can be more than memory is
+    kept for. What comes out of one loop XLA writes over only in another, so there is a loop of one
+    step, of which XLA does not know that. The factor is for what is done with the image: sums or
+    products of two images take XLA's CPU compiler's code 18 times as long, but those of three.
+    """
+    shape = image.shape[0] - 2, image.shape[1] - 2, image.shape[2]
+    added, low, high = (part.reshape(shape) for part in (sums.added, *sums.range))
+
+    def within(added: Array) -> Array:
+        return jnp.clip(image[1:-1, 1:-1] + added, low, high)
+
+    if not (in_place and draws_on_cpu()):
+        return within(added)
+    one = 1 + zero_after(sums.added[0, 0])
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        return state[0] + 1, within(state[1])
+
+    return one * lax.while_loop(lambda state: state[0] < one, step, (one - 1, added))[1]
 
 
 def _along(

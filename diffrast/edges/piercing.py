@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere
 from diffrast._selection import divided, selected
-from diffrast._stored import stored, stored_together
+from diffrast._stored import stored, stored_together, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import first_row, only, picked, pixels_round, steps_to, walk
 from diffrast.edges.pieces import positive_part
@@ -92,7 +92,7 @@ def choose_pixels(
 
     Also of those that show a face, `unseen`, only beside their centres; -1 where there is none.
     """
-    body = _body_of(face_image, bodies)
+    body = _body_of(face_image, bodies + zero_after(unseen[0]))
     largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
     largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
     largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
