@@ -50,7 +50,7 @@ def dot(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
         count = np.broadcast_shapes(a.shape, b.shape)[-1]
     except ValueError as error:
         raise ValueError(f"b: wanted a shape that goes with {a.shape}, got {b.shape}") from error
-    if count not in _FEW:
+    if count not in _FEW or max(a.ndim, b.ndim) < 2:
         return jnp.sum(a * b, axis=-1)
     columns = (_components(jnp.broadcast_to(x, (*x.shape[:-1], count))) for x in (a, b))
     return _sum(x * y for x, y in zip(*columns, strict=True))
@@ -105,9 +105,10 @@ def _components(vectors: Array) -> list[Array]:
     """Along the last axis, each for itself; where they are many all in one, along a first axis.
 
     Reductions of few are calls of a library on a CPU, and take ten times as long as sums of
-    columns; so does what transposes a column that was broadcast along them.
+    columns; so does what transposes a column that was broadcast along them. But they have the same
+    bits in every program, so they are right for a single vector.
     """
-    if vectors.shape[-1] in _FEW:
+    if vectors.shape[-1] in _FEW and vectors.ndim > 1:
         return [vectors[..., i] for i in range(vectors.shape[-1])]
     return [jnp.moveaxis(vectors, -1, 0)]
 
