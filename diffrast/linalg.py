@@ -52,8 +52,8 @@ def dot(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
         raise ValueError(f"b: wanted a shape that goes with {a.shape}, got {b.shape}") from error
     if count not in _FEW or max(a.ndim, b.ndim) < 2:
         return jnp.sum(a * b, axis=-1)
-    columns = (_components(jnp.broadcast_to(x, (*x.shape[:-1], count))) for x in (a, b))
-    return _sum(x * y for x, y in zip(*columns, strict=True))
+    a, b = (jnp.broadcast_to(x, (*x.shape[:-1], count)) for x in (a, b))
+    return _sum(a[..., i] * b[..., i] for i in range(count))
 
 
 def norm(vectors: ArrayLike) -> Float[Array, "..."]:
