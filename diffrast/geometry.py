@@ -202,9 +202,9 @@ def _shortened(matrix: Array, normals: Array) -> Array:
     """Normals of which a matrix makes unit vectors."""
     length = norm(apply_matrix(matrix, normals))
     known = length > 0
-    inverse = jnp.where(known, 1, 0) / jnp.where(known, length, 1)
+    safe = jnp.where(known, length, 1)
     # Each for itself: what transposes a broadcast length takes ten times as long on a CPU.
-    return jnp.stack([normals[..., i] * inverse for i in range(3)], axis=-1)
+    return jnp.stack([jnp.where(known, normals[..., i] / safe, 0) for i in range(3)], axis=-1)
 
 
 def clip_positions(geometry: Geometry, camera: Camera) -> Float[Array, "V 4"]:
