@@ -326,8 +326,8 @@ def with_sums(
 
     In place it is what is added that is written over: one more image can be more than memory is
     kept for. What comes out of one loop XLA writes over only in another, so there is a loop of one
-    step, of which XLA does not know that. The factor is for what is done with the image: on a CPU
-    XLA adds or multiplies images in a 18th of the time where a number is a factor of one.
+    step, of which XLA does not know that. The factor is for what is done with the image next: XLA's
+    CPU code for sums of images alone takes 18 times as long as that with a number in them.
     """
     shape = image.shape[0] - 2, image.shape[1] - 2, image.shape[2]
     added, low, high = (part.reshape(shape) for part in (sums.added, *sums.range))

@@ -92,6 +92,7 @@ def choose_pixels(
 
     Also of those that show a face, `unseen`, only beside their centres; -1 where there is none.
     """
+    # Else all bodies would be looked up, and held, before there is anything unseen.
     body = _body_of(face_image, bodies + zero_after(unseen[0]))
     largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
     largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
