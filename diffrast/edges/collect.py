@@ -191,7 +191,8 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: 
         )
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
-            return with_line(total, view, method, lines_of(crossings, pair, exists))
+            lines = lines_of(crossings, pair, exists, view.topology.patches)
+            return with_line(total, view, method, lines)
 
         return over_batches(crossings.pairs, crossings.total, lines_at_once, add_lines, total)
 

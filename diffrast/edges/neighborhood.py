@@ -24,9 +24,9 @@ def picked(values: Array, index: Array) -> Array:
     return jnp.take_along_axis(values, index[None], axis=0, mode="promise_in_bounds")[0]
 
 
-def first_row(mask: Bool[Array, "rows n"]) -> Int[Array, " n"]:
+def first_row(mask: Bool[Array, "rows *n"]) -> Int[Array, "*n"]:
     """The first row of each column that is true, or as many as there are."""
-    rows = jnp.arange(mask.shape[0])[:, None]
+    rows = jnp.arange(mask.shape[0]).reshape(-1, *[1] * (mask.ndim - 1))
     return jnp.min(jnp.where(mask, rows, rows.size), axis=0)
 
 

@@ -42,7 +42,8 @@ _NEAR = 1.5  # pixels from the centre to where the planes meet that are known at
 _CLOSE = 0.1  # pixels from where two walks ended to where the planes found there meet
 _ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
 _FACES = 2 + 9 + 2 * 3 + 1
-_CENTRE = 2  # the row of what the pixel's centre shows
+_CENTRE = 2  # the row of what the pixel's centre shows, and the first of the nine pixels
+_NEAREST_FIRST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # the order of these
 
 
 class _Planes(NamedTuple):
@@ -153,15 +154,14 @@ def _candidates(
     """Faces at pixels, the unit of their 1/w, and whether those in rows 0 and 1 meet."""
     assert topology.bodies is not None
     pictured = stored(pixels_round(face_image, *pixel))
-    nearest_first = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
-    face = pictured[nearest_first]
+    face = pictured[_NEAREST_FIRST]
     body = _body_of(face, topology.bodies)
     of_seen = _lambdas(pixel, face, faces, pixels)
     seen_planes = stored(_sums(of_seen[0]))
     rows = stored(jnp.stack(_two_bodies(body, seen_planes)))
     pair = jnp.stack([picked(face, row) for row in rows])
     differ = picked(body, rows[0]) != picked(body, rows[1])
-    at = jnp.asarray(nearest_first)[rows]
+    at = jnp.asarray(_NEAREST_FIRST)[rows]
     of_pair = jnp.take_along_axis(seen_planes, rows[None], axis=1, mode="promise_in_bounds")
     pair, met = _meeting(pixel, pair, of_pair, at, exists & differ, faces, pixels, topology, volume)
     nearby = topology.neighbors[jnp.maximum(pair, 0)].transpose(0, 2, 1).reshape(6, -1)
@@ -172,7 +172,7 @@ def _candidates(
         return jnp.concatenate([other[..., :2, :], seen, other[..., 2:, :]], axis=-2)
 
     look = jnp.concatenate([at, jnp.repeat(at, 3, axis=0), jnp.full_like(unseen[None], 4)])
-    look = joined(look, jnp.broadcast_to(nearest_first[:, None], face.shape))
+    look = joined(look, jnp.broadcast_to(_NEAREST_FIRST[:, None], face.shape))
     body = joined(_body_of(others, topology.bodies), body)
     face, lambdas, volume, size = map(joined, (others, *of_others), (face, *of_seen))
     again = jnp.any(
@@ -301,7 +301,12 @@ def _left_of(normal: Array) -> Array:
 
 
 @jax.jit
-def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, " n"]) -> Line:
+def lines_of(
+    crossings: Crossings,
+    pair: Int[Array, " n"],
+    exists: Bool[Array, " n"],
+    patches: Int[Array, " F"],
+) -> Line:
     """The lines along which these pairs of faces pierce each other, where they are visible."""
     both_faces, place = divided(pair, crossings.unit.size)
     one, other = divided(both_faces, _FACES)
@@ -356,16 +361,34 @@ def lines_of(crossings: Crossings, pair: Int[Array, " n"], exists: Bool[Array, "
     # λ is in units of 1/w, and so are the planes and the slope that divides them.
     factor = (last - first) * inverse / crossings.unit[place] * jnp.array([[-1], [1]])
     motion = values[:, None] * (factor * plane)[None]
+    face = both(planes.face)
     return Line(
         pixel=pixel,
         used=used,
-        look=both(planes.look),
-        face=both(planes.face),
+        look=_where_shown(planes.face, face, both(planes.look), patches, x, y),
+        face=face,
         barycentrics=[value / jnp.where(total > 0, total, 1) for value in in_front],
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
     )
+
+
+def _where_shown(
+    seen: Array, face: Array, look: Array, patches: Array, x: Array, y: Array
+) -> Array:
+    """Which of the 3×3 pixels shows the surface of a face nearest to a point; `look` if none does.
+
+    The pixel itself if it does: it is its colour that the other one takes the place of.
+    """
+    seen = seen[_CENTRE : _CENTRE + 9]
+    patch = stored(jnp.where(seen >= 0, patches[jnp.maximum(seen, 0)], -1))
+    across, down = steps_to(jnp.asarray(_NEAREST_FIRST))[..., None]
+    distance = ((x - across) ** 2 + (y - down) ** 2).at[0].set(-1)
+    distance = stored(jnp.where(patch[:, None] == patches[face], distance[:, None], jnp.inf))
+    nearest = jnp.min(distance, axis=0)
+    best = first_row((distance == nearest) & (distance < jnp.inf))
+    return jnp.where(best < 9, jnp.asarray(_NEAREST_FIRST)[jnp.minimum(best, 8)], look)
 
 
 def _kept_aside(
