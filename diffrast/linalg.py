@@ -33,6 +33,8 @@ from jaxtyping import Bool, Float
 from diffrast._check import ArrayInput, float_array, is_concrete
 from diffrast._stored import stored
 
+_FEW = range(2, 5)  # components of a vector
+
 # ------------------------------------------------------------------------------------- vectors
 
 
@@ -45,27 +47,26 @@ def dot(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
     a = float_array("a", a, ("...", "n"), finite=False)
     b = float_array("b", b, ("...", "n"), finite=False)
     try:
-        np.broadcast_shapes(a.shape, b.shape)
+        count = np.broadcast_shapes(a.shape, b.shape)[-1]
     except ValueError as error:
         raise ValueError(f"b: wanted a shape that goes with {a.shape}, got {b.shape}") from error
-    return jnp.sum(a * b, axis=-1)
+    if count not in _FEW or max(a.ndim, b.ndim) < 2:
+        return jnp.sum(a * b, axis=-1)
+    a, b = (jnp.broadcast_to(x, (*x.shape[:-1], count)) for x in (a, b))
+    return _sum(a[..., i] * b[..., i] for i in range(count))
 
 
 def norm(vectors: ArrayLike) -> Float[Array, "..."]:
     """Euclidean length over the last axis; the gradient of a zero vector is zero."""
-    unit_box, magnitude = _scale_to_unit_box(
-        float_array("vectors", vectors, ("...", "n"), finite=False)
-    )
-    length = magnitude[..., 0] * jnp.sqrt(dot(unit_box, unit_box))
-    return jnp.where(magnitude[..., 0] > 0, length, 0)
+    unit_box, magnitude = _scaled_to_unit_box(vectors)
+    return jnp.where(magnitude > 0, magnitude * _length(unit_box), 0)
 
 
 def normalize(vectors: ArrayLike) -> Float[Array, "... n"]:
     """Unit vectors over the last axis; a zero vector stays zero, with zero gradient."""
-    unit_box, magnitude = _scale_to_unit_box(
-        float_array("vectors", vectors, ("...", "n"), finite=False)
-    )
-    return jnp.where(magnitude > 0, unit_box / jnp.sqrt(dot(unit_box, unit_box))[..., None], 0)
+    unit_box, magnitude = _scaled_to_unit_box(vectors)
+    length = _length(unit_box)
+    return _joined([jnp.where(magnitude > 0, x / length, 0) for x in unit_box])
 
 
 def null_vector(rows: Float[Array, "3 4"]) -> Float[Array, "4"]:
@@ -81,17 +82,48 @@ def null_vector(rows: Float[Array, "3 4"]) -> Float[Array, "4"]:
     return jnp.append(a[3] * bc + b[3] * ca + c[3] * ab, -dot(a[:3], bc))
 
 
-def _scale_to_unit_box(vectors: Array) -> tuple[Array, Array]:
+def _scaled_to_unit_box(vectors: ArrayLike) -> tuple[list[Array], Array]:
+    """Components divided by the largest magnitude, so that squares neither over- nor underflow.
+
+    Zero vectors become ones, for the caller to select away. The magnitude carries no gradient:
+    where it is used it cancels.
+    """
+    vectors = float_array("vectors", vectors, ("...", "n"), finite=False)
     if vectors.shape[-1] == 0:
         raise ValueError(f"vectors: wanted at least one component, got shape {vectors.shape}")
-    """Divide by the largest magnitude, so that squares neither over- nor underflow.
-
-    Zero vectors become ones, for the caller to select away. The magnitude (last axis kept, of
-    size one) carries no gradient: where it is used it cancels.
-    """
-    magnitude = jax.lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, keepdims=True))
+    parts = _components(vectors)
+    magnitude = jax.lax.stop_gradient(_reduced(map(jnp.abs, parts), jnp.maximum, jnp.max))
     zero = magnitude == 0
-    return jnp.where(zero, 1, vectors) / jnp.where(zero, 1, magnitude), magnitude
+    return [jnp.where(zero, 1, x) / jnp.where(zero, 1, magnitude) for x in parts], magnitude
+
+
+def _length(parts: list[Array]) -> Array:
+    return jnp.sqrt(_reduced((x * x for x in parts), operator.add, jnp.sum))
+
+
+def _components(vectors: Array) -> list[Array]:
+    """Along the last axis, each for itself; where they are many all in one, along a first axis.
+
+    Reductions of few are calls of a library on a CPU, and take ten times as long as sums of
+    columns; so does what transposes a column that was broadcast along them. But they have the same
+    bits in every program, so they are right for a single vector.
+    """
+    if vectors.shape[-1] in _FEW and vectors.ndim > 1:
+        return [vectors[..., i] for i in range(vectors.shape[-1])]
+    return [jnp.moveaxis(vectors, -1, 0)]
+
+
+def _reduced(
+    parts: Iterable[Array], pair: Callable[[Array, Array], Array], whole: Callable[..., Array]
+) -> Array:
+    """All components in one, by `pair` of two or, where they are many, by `whole`."""
+    first, *others = parts
+    return functools.reduce(pair, others, first) if others else whole(first, axis=0)
+
+
+def _joined(parts: list[Array]) -> Array:
+    """The inverse of `_components`."""
+    return jnp.stack(parts, axis=-1) if len(parts) > 1 else jnp.moveaxis(parts[0], 0, -1)
 
 
 # -------------------------------------------------------------------------- building transforms

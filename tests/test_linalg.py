@@ -40,6 +40,26 @@ def test_zero_vectors_stay_zero_with_zero_derivatives():
         assert not np.any(jax.grad(lambda v, f=function: f(v).sum())(zero))
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 9])
+def test_vectors_of_few_and_of_many_components(count):
+    a, b = RNG.normal(size=(2, 4, 5, count)).astype(np.float32)
+    length = np.linalg.norm(a, axis=-1)
+    np.testing.assert_allclose(linalg.norm(a), length, rtol=1e-5)
+    np.testing.assert_allclose(linalg.normalize(a), a / length[..., None], rtol=1e-5)
+    for other in (b, b[0, 0], b[:, :1], b[..., :1]):
+        np.testing.assert_allclose(linalg.dot(a, other), np.sum(a * other, axis=-1), atol=1e-5)
+        np.testing.assert_allclose(linalg.dot(other, a), np.sum(a * other, axis=-1), atol=1e-5)
+
+
+def test_vectors_of_three_components_are_no_reductions():
+    """Which take a CPU ten times as long, as does what transposes a broadcast."""
+    vectors = jnp.ones((7, 3))
+    for function in (linalg.norm, linalg.normalize, lambda v: linalg.dot(v, v)):
+        _, pull = jax.vjp(function, vectors)
+        for program in (jax.jit(function).lower(vectors), jax.jit(pull).lower(function(vectors))):
+            assert "reduce" not in program.as_text()
+
+
 def test_vector_derivatives_to_second_order():
     with jax.enable_x64(True):
         vectors, tangents = RNG.normal(size=(2, 4, 3))

@@ -7,7 +7,7 @@ largest s at that vertex: the factors common to a vertex cancel.
 """
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from diffrast import _check, _topology
 from diffrast._check import ArrayInput
+from diffrast._stored import stored_rows
 from diffrast.linalg import dot, norm, normalize
 from diffrast.mesh.triangles import Mesh, arrays, corner_positions, uv_faces_of
 
@@ -111,7 +112,9 @@ def _scaled_edges(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
     """Two edges of every face from its first corner, divided by the face's size; the size."""
     a, b, c = corner_positions(vertices, faces)
     edges = jnp.stack([b - a, c - a])
-    size = jnp.max(jnp.abs(lax.stop_gradient(edges)), axis=(0, 2))
+    # One by one: a reduction is a call of a library on a CPU, and takes ten times as long.
+    extents = jnp.abs(lax.stop_gradient(edges))
+    size = reduce(jnp.maximum, [edge[:, i] for edge in extents for i in range(3)])
     first, second = edges / jnp.where(size > 0, size, 1)[:, None]
     return first, second, size
 
@@ -137,20 +140,23 @@ def _vertex_normals(vertices: Array, faces: Array, groups: Array | None, weighti
         largest = jnp.zeros_like(size, shape=vertices.shape[0]).at[owners].max(size[:, None])
         largest = jnp.where(largest > 0, largest, 1)
         weights = (size[:, None] / largest[owners]) ** 2
-        shares = area_vector[:, None] * weights[..., None]
+        normals = area_vector
     else:
         normals = normalize(area_vector)
-        angles = _corner_angles(first, second) if weighting == "angle" else 1.0
-        shares = jnp.broadcast_to(normals[:, None], (*faces.shape, 3)) * angles
-    sums = jnp.zeros_like(vertices).at[owners].add(shares)
+        ones = jnp.ones(faces.shape, normals.dtype)
+        weights = _corner_angles(first, second) if weighting == "angle" else ones
+    sums = jnp.zeros_like(vertices)
+    for corner in range(3):
+        sums = sums.at[owners[:, corner]].add(normals * weights[:, corner, None])
+    sums = stored_rows(sums)  # which its transpose looks up for each face
     unit = normalize(sums)
     return unit if groups is None else unit[groups]
 
 
 def _corner_angles(first: Array, second: Array) -> Array:
-    """Angles at the three corners, shape (faces, 3, 1); 0 where an edge has no length."""
+    """Angles at the three corners, shape (faces, 3); 0 where an edge has no length."""
     edges = normalize(jnp.stack([first, second - first, -second], axis=1))  # a→b, b→c, c→a
     arriving = -jnp.roll(edges, 1, axis=1)
     sine, cosine = norm(jnp.cross(edges, arriving)), dot(edges, arriving)
     undefined = (sine == 0) & (cosine == 0)
-    return jnp.arctan2(sine, jnp.where(undefined, 1, cosine))[..., None]
+    return jnp.arctan2(sine, jnp.where(undefined, 1, cosine))
