@@ -19,7 +19,7 @@ from diffrast._topology import Topology
 from diffrast.bending import Turning, find_turning
 from diffrast.camera import Camera, central_rays
 from diffrast.deferred import comes_held, shade_covered
-from diffrast.edges import View, antialias_image
+from diffrast.edges import View, antialias_image, with_depth
 from diffrast.geometry import (
     Points,
     apart_edges,
@@ -151,14 +151,22 @@ def render(
             topology = scene_topology(scene)
             apart = _apart(world, topology, settings)
             turning = find_turning(face, hard) if in_batches else None
-            image = _with_edges(
+            view = _edged_view(
                 hard, world, topology, apart, clip, pixels, reached, background, turning, settings
+            )
+            image = antialias_image(
+                view,
+                shader=partial(_shade_points, shading=settings.shading),
+                glow=partial(_glow_at, shading=settings.shading),
+                cull_backfaces=settings.cull_backfaces,
             )
         if turning is not None:
             with jax.named_scope("turning"):
                 unshadowed = world._replace(shadows=None)
+                volume = view.volume
+                assert volume is not None
                 image = with_turns(
-                    shader, unshadowed, drawn, reached, topology, apart, turning, image
+                    shader, unshadowed, drawn, reached, topology, apart, volume, turning, image
                 )
         if side == 1:
             return image
@@ -266,7 +274,7 @@ def _apart(world: World, topology: Topology, settings: RenderSettings) -> Array:
     return apart
 
 
-def _with_edges(
+def _edged_view(
     image: Array,
     world: World,
     topology: Topology,
@@ -277,7 +285,8 @@ def _with_edges(
     background: Array,
     turning: Turning | None,
     settings: RenderSettings,
-) -> Array:
+) -> View:
+    """What `antialias_image` takes."""
     geometry = world.geometry
     cast = cast_outlines(world, topology, pixels, reached)
     if settings.shading == "flat":  # every face has a colour of its own
@@ -295,12 +304,7 @@ def _with_edges(
         cast=cast,
         meaned=None if turning is None else turning.chosen,
     )
-    return antialias_image(
-        view,
-        shader=partial(_shade_points, shading=settings.shading),
-        glow=partial(_glow_at, shading=settings.shading),
-        cull_backfaces=settings.cull_backfaces,
-    )
+    return with_depth(view)
 
 
 @partial(jax.jit, static_argnames="shading")

@@ -25,7 +25,7 @@ from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.bending import Chosen, Turning, bending
 from diffrast.edges.neighborhood import walk
-from diffrast.edges.pieces import facing, to_pixels
+from diffrast.edges.pieces import to_pixels
 from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
@@ -86,6 +86,7 @@ def with_turns(
     reached: Reached,
     topology: Topology,
     apart: Bool[Array, " edges"],
+    volume: Float[Array, " faces"],
     turning: Turning,
     image: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 3"]:
@@ -101,6 +102,7 @@ def with_turns(
         reached: by each light; images of that size.
         topology: of the faces.
         apart: whether colours may jump across an edge.
+        volume: of faces, what `facing` found.
         turning: what `find_turning` found; the edges know of the pixels chosen there.
         image: with edges and without the border.
     """
@@ -114,15 +116,16 @@ def with_turns(
         faces: Array,
         topology: Topology,
         apart: Array,
+        volume: Array,
     ) -> _Points:
         chosen = bending(turning, image)
         row, column = divided(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart)
+        face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart, volume)
         return _Points(chosen, face, lit)
 
     seen = lax.stop_gradient((image, reached, drawn.positions_clip))
-    surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart
+    surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart, lax.stop_gradient(volume)
     points = over_views(find, height * width)(turning, *seen, *surface)
     added = _added(shade, (height, width), _Inputs(data, drawn, points))
     number, _, total = points.chosen
@@ -154,6 +157,7 @@ def _faces_at(
     faces: Array,
     topology: Topology,
     apart: Array,
+    volume: Array,
 ) -> Int[Array, "points parts"]:
     """The faces at the points of pixels, found from those at their centres.
 
@@ -165,7 +169,7 @@ def _faces_at(
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
         neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
-        surface = faces, pixels, neighbors, facing(pixels, faces)
+        surface = faces, pixels, neighbors, volume
 
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(chosen, n, count)
@@ -189,7 +193,7 @@ def _faces_at(
         return _over_parts(chosen, count, add, found)
 
     nowhere = jnp.full((_POINTS.shape[1], chosen.number.size), -1, jnp.int32)
-    nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart))
+    nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart, volume))
     return lax.cond(anywhere(count > 0), find, lambda nowhere: nowhere, nowhere)
 
 

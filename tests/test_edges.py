@@ -10,6 +10,7 @@ import pytest
 
 import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
+from diffrast.edges.antialias import with_depth
 from diffrast.edges.blend import Method, View
 from diffrast.edges.collect import collect
 from diffrast.edges.derivative import apply_linear
@@ -288,6 +289,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
         background=color[-1].astype(jnp.float32),
         scene=None,
     )
+    view = with_depth(view)
 
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):

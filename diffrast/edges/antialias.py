@@ -14,11 +14,12 @@ from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._device import over_views
 from diffrast._linear import without_known_zeros
+from diffrast._stored import stored
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
 from diffrast.edges.collect import collect
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
-from diffrast.edges.pieces import depth_of, scale_by_depth, to_pixels
+from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
 
 CREASES = ("none", "seams", "all")
@@ -123,7 +124,7 @@ def antialias(
         scene=data,
     )
     own = None if shader is None else _by_columns(shader)
-    return antialias_image(view, shader=own, cull_backfaces=cull_backfaces)
+    return antialias_image(with_depth(view), shader=own, cull_backfaces=cull_backfaces)
 
 
 def _by_columns(shader: PointShader) -> Shader:
@@ -134,13 +135,37 @@ def _by_columns(shader: PointShader) -> Shader:
     return shade
 
 
+def with_depth(view: View) -> View:
+    """The view with what tells which of its faces are nearer, and which side each turns to the eye.
+
+    Lights and their weights follow its positions, then, if it has shadows.
+    """
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    depth = depth_of(view.positions_clip)
+    scale = scale_by_depth(depth, view.positions_clip)
+    if view.topology.bodies is None and view.cast is None:
+        # It moves nothing but lines in which planes meet.
+        scale = lax.stop_gradient(scale)
+    positions_clip = view.positions_clip * scale[:, None]
+
+    def volume_of(positions_clip: Array, faces: Array) -> Array:
+        return facing(stored(to_pixels(positions_clip, height, width)), faces)
+
+    volume = over_views(volume_of, height * width)(lax.stop_gradient(positions_clip), view.faces)
+    if view.cast is not None:
+        cast, rows = with_lights(view.cast, depth)
+        positions_clip = jnp.concatenate([positions_clip, rows])
+        view = view._replace(cast=cast)
+    return view._replace(positions_clip=positions_clip, scale=scale, volume=volume)
+
+
 def antialias_image(
     view: View, *, shader: Shader | None, glow: Glow | None = None, cull_backfaces: bool
 ) -> Float[Array, "height width channels"]:
     """Give an image its edges, in value and in derivative, and cut off its border of one pixel.
 
     Args:
-        view: what is drawn, and the image without edges; its `scale` is found here.
+        view: what is drawn, and the image without edges; a result of `with_depth`.
         shader: see `Method`.
         glow: likewise; needed if the view has shadows.
         cull_backfaces: whether only front faces are drawn.
@@ -148,17 +173,6 @@ def antialias_image(
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 10 / ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
-    depth = depth_of(view.positions_clip)
-    scale = scale_by_depth(depth, view.positions_clip)
-    if view.topology.bodies is None and view.cast is None:
-        # It moves nothing but lines in which planes meet.
-        scale = lax.stop_gradient(scale)
-    positions_clip = view.positions_clip * scale[:, None]
-    if view.cast is not None:
-        cast, rows = with_lights(view.cast, depth)
-        positions_clip = jnp.concatenate([positions_clip, rows])
-        view = view._replace(cast=cast)
-    view = view._replace(positions_clip=positions_clip, scale=scale)
 
     def gather(view: View, method: Method) -> Blended:
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)

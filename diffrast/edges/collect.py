@@ -30,7 +30,6 @@ from diffrast.edges.pieces import (
     choose_edges,
     clip_edges,
     cut,
-    facing,
     first_ones,
     gathered,
     instead_of_first,
@@ -72,7 +71,8 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     """
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     pixels = stored(to_pixels(view.positions_clip, height, width))
-    volume = facing(pixels, view.faces)
+    volume = view.volume
+    assert volume is not None
     if method.cull_backfaces:
         front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
         volume = stored(jnp.where(front, volume, 0))
