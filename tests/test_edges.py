@@ -96,6 +96,27 @@ def test_values_and_derivatives_are_finite(case):
             assert np.all(np.isfinite(leaf))
 
 
+@pytest.mark.parametrize("level", [1, 2])
+def test_outlines_at_faces_seen_edge_on_count_once(level):
+    """Both sides of such a face end in one place, and hardly one behind the other."""
+    ball, rng = dr.shapes.icosphere(level), np.random.default_rng(level)
+    corners = np.float64(ball.vertices)[ball.faces]
+    white = dr.Object(ball, dr.Material(ambient=(1, 1, 1), diffuse=(0, 0, 0)))
+    scene = dr.Scene(objects=[white], lights=[dr.AmbientLight(color=(1, 1, 1))])
+    sizes = {"height": 16, "width": 16}
+    smooth = jax.jit(lambda view: dr.render(scene, view, dr.RenderSettings(**sizes)))
+    settings = dr.RenderSettings(**sizes, antialias=False, samples=24**2)
+    sampled = jax.jit(lambda view: dr.render(scene, view, settings))
+    for a, b, c in corners[rng.choice(len(corners), 12, replace=False)]:
+        along = (b - a) + rng.normal() * (c - a)
+        along *= 4 / np.linalg.norm(along)
+        place = {"target": (0, 0, 0), "up": rng.normal(size=3), "near": 0.1, "far": 9}
+        near = dr.Camera.perspective(eye=(a + b + c) / 3 + along, fov_y=0.55, **place)
+        parallel = dr.Camera.orthographic(eye=along, height=2.2, **place)
+        for view in (near, parallel):
+            np.testing.assert_allclose(smooth(view), sampled(view), atol=0.03)
+
+
 def test_bodies_that_lie_in_one_another_have_no_line_in_common():
     """A cube twice, in two colours: nothing changes where nothing does with one in view."""
     cube = dr.shapes.cube()

@@ -68,7 +68,10 @@ def is_near_background(
 
 
 def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "12 n"]:
-    """The faces up to two edges away from each of the two faces of an edge, but for the other."""
+    """The faces up to two edges away from each of the two faces of an edge, but for the other.
+
+    First the four next to these: the first of each, then the second.
+    """
     near = _across(face, face[::-1], neighbors)
     far = _across(near, face[None], neighbors)
     return jnp.concatenate([near.reshape(4, -1), far.reshape(8, -1)])

@@ -58,7 +58,8 @@ def first_part(candidates: Candidates, fold: Bool[Array, " n"]) -> Part:
     left = jnp.max(jnp.where(reaches & (low <= other[0]), high, 0), axis=0)
     entered = jnp.min(jnp.where(reaches & (high >= one[0]), low, 1), axis=0)
     change = jnp.where(ends_first, left, entered)
-    changes = fold & (one[2] != other[2]) & (change > t[0]) & (change < t[2])
+    changes = fold & (one[2] != other[2])
+    changes = changes & (change > begin + _SLIVER) & (change < end - _SLIVER)
     return Part(*stored_together((begin, jnp.where(changes, change, end), last)))
 
 

@@ -48,7 +48,7 @@ class AtOnce(NamedTuple):
 class Segments(NamedTuple):
     """Clipped edges on the screen; one entry an edge, along the last axis."""
 
-    faces: Int[Array, "2 n"]  # -1 where there is none, or where it is not drawn
+    faces: Int[Array, "2 n"]  # -1 where there is none, -2 - number of one that is not drawn
     corners: Int[Array, "2 n"]  # of each face: index of the start times 3 plus that of the end
     vertices: Int[Array, "2 n"]  # start and end
     fold: Bool[Array, " n"]  # both faces on one side, or one face only
@@ -216,7 +216,7 @@ def clip_edges(
     first_cell, length = _forward(ends)
     crossings = jnp.sum(jnp.floor(first_cell + length), axis=0).astype(jnp.int32)
     return Segments(
-        faces=jnp.where(drawn, edges.faces.T, -1),
+        faces=jnp.where(drawn, edges.faces.T, -2 - jnp.maximum(edges.faces.T, -1)),
         corners=corners,
         vertices=vertices,
         fold=fold,

@@ -173,7 +173,9 @@ def look(
     t = (pieces.range[0] + pieces.range[1]) / 2
     thickness = stored(_thickness(front, front_corners, faces, pixels, ends[0], normal, length, t))
     pictured = stored(pixels_round(face_image, *pieces.pixel))
-    nearby = only(ring_of_edge(own, topology.neighbors), volume != 0)
+    undrawn = own < -1
+    of_edge = jnp.where(undrawn, -2 - own, own)
+    nearby = only(ring_of_edge(of_edge, topology.neighbors), volume != 0)
     around = stored(jnp.concatenate([pictured, nearby]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
@@ -189,7 +191,10 @@ def look(
     front_patch = stored(topology.patches[jnp.maximum(front, 0)])
     touching = (patch == front_patch) | fine
     tolerance = jnp.array(TOLERANCE, depth.dtype)
-    tolerance = stored(jnp.where(touching, FINE_TOLERANCE, tolerance))
+    tolerance = jnp.where(touching, FINE_TOLERANCE, tolerance)
+    # Both sides of a face that is seen edge-on end in one place, and may be equally near.
+    across = jnp.where(jnp.tile(undrawn, (2, 1)), 0, tolerance[9:13])
+    tolerance = stored(tolerance.at[9:13].set(across))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
         face=around,
@@ -203,11 +208,13 @@ def look(
     half = stored((part.begin + part.end) / 2)
     first, last = pieces.range
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
-    exists = pieces.exists & (low < high)
+    exists = pieces.exists & (part.begin < part.end)
+    # Of a part that rounding makes nothing of, what follows is left all the same, and is less.
+    following = jnp.maximum(high, jnp.nextafter(first, last))
     left = pieces._replace(
-        range=jnp.stack([high, end]), exists=exists & ((end - high) * length > SHORT)
+        range=jnp.stack([following, end]), exists=exists & ((end - following) * length > SHORT)
     )
-    visible, low, high, t, left = stored_together((exists, low, high, t, left))
+    visible, low, high, t, left = stored_together((exists & (low < high), low, high, t, left))
     begin, end, middle = stored_together([start + at * along for at in (low, high, t)])
     near = stored(inverse_depth(t))
 
