@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -54,6 +55,9 @@ _FINE = 1.0  # square pixels: faces of half this area may hide others that no pi
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
 BACKGROUND = -2
+# Which of the candidates, behind those at nine pixels, are next to an edge's first face, or second.
+_NEXT = np.zeros((2, 9 + 12, 1), bool)
+_NEXT[0, [9, 11]] = _NEXT[1, [10, 12]] = True
 
 
 class Side(NamedTuple):
@@ -193,8 +197,8 @@ def look(
     tolerance = jnp.array(TOLERANCE, depth.dtype)
     tolerance = jnp.where(touching, FINE_TOLERANCE, tolerance)
     # Both sides of a face that is seen edge-on end in one place, and may be equally near.
-    across = jnp.where(jnp.tile(undrawn, (2, 1)), 0, tolerance[9:13])
-    tolerance = stored(tolerance.at[9:13].set(across))
+    across = (_NEXT[0] & undrawn[0]) | (_NEXT[1] & undrawn[1])
+    tolerance = stored(jnp.where(across, 0, tolerance))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
         face=around,
@@ -210,7 +214,7 @@ def look(
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
     exists = pieces.exists & (part.begin < part.end)
     # Of a part that rounding makes nothing of, what follows is left all the same, and is less.
-    following = jnp.maximum(high, jnp.nextafter(first, last))
+    following = jnp.maximum(high, first * (1 + jnp.finfo(first.dtype).eps))
     left = pieces._replace(
         range=jnp.stack([following, end]), exists=exists & ((end - following) * length > SHORT)
     )
