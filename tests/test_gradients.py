@@ -162,14 +162,15 @@ BETTER = {
 
 @pytest.mark.parametrize("name", BOUNDS)
 def test_derivatives_are_those_of_the_box_filtered_image(name):
-    found = errors(name)
+    results = results_at(name, 0)
+    found = errors(name, *results)
     image_error = found.pop("image")
     assert image_error < BOUNDS[name][2]
     for key, error in found.items():
         if name != "sphere" or not key.endswith("object rotation"):
             assert error < BOUNDS[name][key.startswith("L2")], (key, found)
     # Rounding decides of hardly anything: of one pixel, and of shares of the derivatives.
-    problem, image, projections, _ = results_at(name, 0)
+    problem, image, projections, _ = results
     _, moved, others, _ = results_at(name, 2e-7)
     pixel, share = (0.06, 0.01) if name in FINE else (0.005, 0.001)
     assert np.abs(moved - image).max() < pixel
@@ -249,20 +250,26 @@ def test_parallel_projection_has_the_same_edges(name, window, group, way):
     assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
 
 
-def results_at(name, change, **options):
-    """The problem, and what `derivatives` finds where the parameters are changed that much."""
+@cache
+def problem_and_target(name):
+    """A problem, and the image that its L2 loss is taken to."""
     problem = gradient_scenes.SCENES[name]()
     target = reference.reference_image(problem, reference.load(name)["target_image_params"])
+    return problem, np.float32(target)
+
+
+def results_at(name, change):
+    """The problem, and what `derivatives` finds where the parameters are changed that much."""
+    problem, target = problem_and_target(name)
     fields = np.float32(reference.adjoint_fields(problem.size))
     params = change * np.random.default_rng(3).normal(size=reference.parameters(problem))
-    at, settings = scene_of(problem, name), settings_of(problem, **options)
-    results = derivatives(at, np.float32(params), settings, fields, np.float32(target))
+    at, settings = scene_of(problem, name), settings_of(problem)
+    results = derivatives(at, np.float32(params), settings, fields, target)
     return problem, *map(np.asarray, results)
 
 
-def errors(name, **options):
+def errors(name, problem, image, projections, gradient):
     """Relative errors of the projected derivatives and of the L2 gradient, by parameter group."""
-    problem, image, projections, gradient = results_at(name, 0, **options)
     stored = reference.load(name)
     units = reference.step_sizes(problem)
     result = {}
@@ -281,7 +288,7 @@ def errors(name, **options):
 
 def main():
     for name in sys.argv[1:] or gradient_scenes.SCENES:
-        found = errors(name)
+        found = errors(name, *results_at(name, 0))
         text = "  ".join(f"{key} {value:.4f}" for key, value in found.items())
         print(f"{name:10} {text}", flush=True)
 

@@ -30,6 +30,12 @@ def first_row(mask: Bool[Array, "rows *n"]) -> Int[Array, "*n"]:
     return jnp.min(jnp.where(mask, rows, rows.size), axis=0)
 
 
+def least_row(mask: Bool[Array, "rows *n"], values: Float[Array, "rows *#n"]) -> Int[Array, "*n"]:
+    """The first row of each column where a value is least, of a mask, or as many as there are."""
+    values = stored(jnp.where(mask, values, jnp.inf))
+    return first_row(mask & (values == jnp.min(values, axis=0)))
+
+
 def pixel_at(
     point: Float[Array, "2 n"], direction: Float[Array, "2 n"], distance: Array | float
 ) -> Int[Array, " n"]:

@@ -27,7 +27,15 @@ from diffrast._device import anywhere
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together, zero_after
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import first_row, only, picked, pixels_round, steps_to, walk
+from diffrast.edges.neighborhood import (
+    first_row,
+    least_row,
+    only,
+    picked,
+    pixels_round,
+    steps_to,
+    walk,
+)
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import TOLERANCE, Table, area, corners_of
 
@@ -201,8 +209,7 @@ def _two_bodies(body: Array, planes: Array) -> tuple[Array, Array]:
     distance = abs(value) / jnp.where(steepness > 0, steepness, 1)
     never = jnp.finfo(distance.dtype).max
     distance = jnp.where((steepness > 0) & (distance < never), distance, never)
-    distance = stored(jnp.where(differs, distance, jnp.inf))
-    return one, jnp.minimum(first_row(differs & (distance == jnp.min(distance, axis=0))), last)
+    return one, jnp.minimum(least_row(differs, distance), last)
 
 
 def _meeting(
@@ -385,9 +392,7 @@ def _where_shown(
     patch = stored(jnp.where(seen >= 0, patches[jnp.maximum(seen, 0)], -1))
     across, down = steps_to(jnp.asarray(_NEAREST_FIRST))[..., None]
     distance = ((x - across) ** 2 + (y - down) ** 2).at[0].set(-1)
-    distance = stored(jnp.where(patch[:, None] == patches[face], distance[:, None], jnp.inf))
-    nearest = jnp.min(distance, axis=0)
-    best = first_row((distance == nearest) & (distance < jnp.inf))
+    best = least_row(patch[:, None] == patches[face], distance[:, None])
     return jnp.where(best < 9, jnp.asarray(_NEAREST_FIRST)[jnp.minimum(best, 8)], look)
 
 

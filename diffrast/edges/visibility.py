@@ -21,6 +21,7 @@ from diffrast._topology import Topology, third_corner
 from diffrast.edges.neighborhood import (
     first_row,
     is_near_background,
+    least_row,
     only,
     picked,
     pixel_at,
@@ -400,8 +401,7 @@ def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
 
 def _seen_least(mask: Array, pictured: Array, values: Array) -> Array:
     """What the pixel of the 3×3 shows where a value is least, of a mask; or -1."""
-    values = stored(jnp.where(mask, values, jnp.inf))
-    best = first_row(mask & (values == jnp.min(values, axis=0)))
+    best = least_row(mask, values)
     return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
 
 
