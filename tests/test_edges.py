@@ -117,6 +117,34 @@ def test_outlines_at_faces_seen_edge_on_count_once(level):
             np.testing.assert_allclose(smooth(view), sampled(view), atol=0.03)
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_boxes_in_a_row_have_no_seam(whole):
+    """The sides in which they touch are not seen, and nor are the edges of these."""
+    cube, places = dr.shapes.cube(), (-2.0, 0.0, 2.0)
+    if whole:
+        count = np.arange(len(places))[:, None, None]
+        row = dr.Mesh(
+            vertices=np.concatenate([cube.vertices + np.array([x, 0, 0]) for x in places]),
+            faces=np.concatenate(cube.faces + count * len(cube.vertices)),
+            normals=np.tile(cube.normals, (len(places), 1)),
+        )
+        boxes = [dr.Object(row, dr.Material(diffuse=(0.8, 0.7, 0.5)))]
+    else:
+        boxes = [
+            dr.Object(cube, dr.Material(diffuse=color), dr.linalg.translation((x, 0, 0)))
+            for x, color in zip(places, np.eye(3), strict=True)
+        ]
+    scene = dr.Scene(objects=boxes, lights=[dr.DirectionalLight(direction=(-0.3, -0.5, -1))])
+    smooth = jax.jit(lambda view: dr.render(scene, view, SETTINGS))
+    settings = dataclasses.replace(SETTINGS, antialias=False, samples=24**2)
+    sampled = jax.jit(lambda view: dr.render(scene, view, settings))
+    for eye in ((0, 5, 5), (5, 5, 5), (-5, 5, 5), (1.5, 3, 7)):
+        place = {"eye": eye, "target": (0, 0, 0), "up": (0, 1, 0), "near": 0.1, "far": 20}
+        near = dr.Camera.perspective(fov_y=0.8, **place)
+        for view in (near, dr.Camera.orthographic(height=6, **place)):
+            np.testing.assert_allclose(smooth(view), sampled(view), atol=0.03)
+
+
 def test_bodies_that_lie_in_one_another_have_no_line_in_common():
     """A cube twice, in two colours: nothing changes where nothing does with one in view."""
     cube = dr.shapes.cube()

@@ -54,6 +54,7 @@ ORDER = [
     "diffrast.edges.parts",
     "diffrast.edges.neighborhood",
     "diffrast.edges.rim",
+    "diffrast.edges.creases",
     "diffrast.edges.visibility",
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_lines",

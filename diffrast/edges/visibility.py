@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
+from diffrast.edges.creases import buried
 from diffrast.edges.neighborhood import (
     first_row,
     is_near_background,
@@ -222,6 +223,20 @@ def look(
     visible, low, high, t, left = stored_together((exists & (low < high), low, high, t, left))
     begin, end, middle = stored_together([start + at * along for at in (low, high, t)])
     near = stored(inverse_depth(t))
+
+    hidden = buried(
+        visible & ~fold,
+        centre + middle,
+        out,
+        near,
+        jnp.stack([front, other]),
+        around,
+        faces,
+        pixels,
+        topology.neighbors,
+        volume,
+    )
+    visible = visible & ~hidden
 
     # What is behind.
     nearest, best = (rows[0] for rows in nearest_behind(candidates, half[None]))
