@@ -12,7 +12,7 @@ import diffrast as dr
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.antialias import with_depth
 from diffrast.edges.blend import Method, View
-from diffrast.edges.collect import collect
+from diffrast.edges.collect import collect, unseen_faces
 from diffrast.edges.derivative import apply_linear
 from diffrast.edges.pieces import (
     AtOnce,
@@ -343,8 +343,8 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
         method = Method(None, None, False, capacity)
-        records, sums = collect(view, method)
-        found = view._replace(unseen=sums.unseen)
+        found = view._replace(unseen=unseen_faces(view, method))
+        records, sums = collect(found, method)
 
         def change(points, colors):
             return apply_linear(found, method, records, sums.rims, points, colors)

@@ -17,7 +17,7 @@ from diffrast._linear import without_known_zeros
 from diffrast._stored import stored
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
-from diffrast.edges.collect import collect
+from diffrast.edges.collect import collect, unseen_faces
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -174,6 +174,10 @@ def antialias_image(
     capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 10 / ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
+    if view.topology.bodies is not None:
+        find = over_views(lambda view: unseen_faces(view, method), height * width)
+        view = view._replace(unseen=find(lax.stop_gradient(view)))
+
     def gather(view: View, method: Method) -> Blended:
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)
         return found
@@ -191,7 +195,7 @@ def antialias_image(
         now = rest._replace(image=image, positions_clip=positions_clip)
         records, sums = gather(now, method)
         assert sums is not None
-        return with_sums(image, sums, in_place=True), (records, sums.rims, sums.unseen)
+        return with_sums(image, sums, in_place=True), (records, sums.rims)
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, rest = primals
@@ -199,10 +203,9 @@ def antialias_image(
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(image, positions_clip, rest)
         now = rest._replace(image=image, positions_clip=positions_clip)
-        now, (records, rims, unseen) = lax.stop_gradient((now, made_of))
+        now, (records, rims) = lax.stop_gradient((now, made_of))
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels)
-        now = now._replace(unseen=unseen)
         d_out = apply_linear(now, method, records, rims, points, colors)
         return (out, made_of), d_out.reshape(height, width, channels)
 

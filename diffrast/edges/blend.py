@@ -53,7 +53,9 @@ class View(NamedTuple):
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
-    unseen: Int[Array, " pixels"] | None = None  # see `Sums`
+    # Where there are several bodies: a face that has an edge in the pixel, but is seen at no centre
+    # round it, where another body is; or -1.
+    unseen: Int[Array, " pixels"] | None = None
 
 
 class Method(NamedTuple):
@@ -80,8 +82,6 @@ class Sums(NamedTuple):
     added: Float[Array, "pixels channels"]
     range: tuple[Array, Array]  # least and greatest colours that each pixel holds
     rims: Float[Array, " pixels_with_border"] | None  # length of smooth rims about pixels' centres
-    # Where there are several bodies: a face that an edge shows, but no centre round it; or -1.
-    unseen: Int[Array, " pixels"] | None
 
 
 class Blended(NamedTuple):
@@ -133,10 +133,7 @@ def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Ble
     if start is not None:
         return Blended(records, None)
     own = cropped(view.image, view.image.shape) + zero
-    unseen = None
-    if view.topology.bodies is not None:
-        unseen = jnp.full(own.shape[0], -1, view.face_image.dtype) + zero
-    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims, unseen))
+    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
@@ -245,9 +242,6 @@ def with_pieces(
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
     if sums is not None and sums.rims is not None:
         sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
-    if sums is not None and sums.unseen is not None:
-        face = stored(jnp.where(found.visible & found.unseen, found.front.face, -1))
-        sums = sums._replace(unseen=sums.unseen.at[_number(view, pieces.pixel)].max(face))
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),

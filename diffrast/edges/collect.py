@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 
 from diffrast._device import anywhere, lanes
 from diffrast._selection import batches_of, divided, over_batches, prefix_sum
-from diffrast._stored import stored, zero_after
+from diffrast._stored import stored, stored_together, zero_after
 from diffrast.edges.blend import (
     Blended,
     Method,
@@ -23,8 +23,10 @@ from diffrast.edges.blend import (
     with_pieces,
     with_shadow,
 )
-from diffrast.edges.neighborhood import near_background
+from diffrast.edges.neighborhood import largest_of_blocks, largest_round, near_background
 from diffrast.edges.pieces import (
+    Pieces,
+    Segments,
     Waiting,
     behind,
     choose_edges,
@@ -40,16 +42,20 @@ from diffrast.edges.pieces import (
 from diffrast.edges.piercing import (
     LINES_AT_ONCE,
     PIXELS_AT_ONCE,
+    bodies_round,
     choose_pixels,
     cross,
     lines_of,
+    ranks,
 )
 from diffrast.edges.records import Start, after_batch, has_room
 from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
 from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
-from diffrast.edges.visibility import look, uncovered
+from diffrast.edges.visibility import look, uncovered, unpictured
+
+_NEAR = 16  # pixels
 
 Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
 
@@ -66,16 +72,9 @@ class Work(NamedTuple):
 def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     """Find the visible pieces, and the sum of what they add to the image.
 
-    With `start`, the `following` of earlier records, only those are made that begin there; then the
-    view needs what the `Sums` found to be `unseen`.
+    With `start`, the `following` of earlier records, only those are made that begin there.
     """
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    pixels = stored(to_pixels(view.positions_clip, height, width))
-    volume = view.volume
-    assert volume is not None
-    if method.cull_backfaces:
-        front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
-        volume = stored(jnp.where(front, volume, 0))
+    pixels, volume = _drawn(view, method)
 
     def is_wanted(total: Blended) -> Array:
         assert total.records is not None
@@ -105,11 +104,103 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     for part in work:
         blended, passed = with_batches(blended, passed, part)
     if view.topology.bodies is not None:
-        unseen = view.unseen if blended.sums is None else blended.sums.unseen
-        assert unseen is not None
-        piercing = _piercing(view, method, pixels, volume, unseen)
-        blended, _ = with_batches(blended, passed, piercing)
+        blended, _ = with_batches(blended, passed, _piercing(view, method, pixels, volume))
     return blended
+
+
+def unseen_faces(view: View, method: Method) -> Int[Array, " pixels"]:
+    """What is to be the view's `unseen`: of several the nearest."""
+    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    assert bodies is not None
+    edges = _Edges(view, *_drawn(view, method))
+    seen = bodies_round(view.face_image, bodies)
+    seen_near = jnp.stack([largest_round(largest_of_blocks(rank, _NEAR)) for rank in seen])
+
+    def are_others(face: Array, seen: Array) -> Array:
+        """Whether bodies that are seen are others than that of faces."""
+        return jnp.any(seen > ranks(bodies[jnp.maximum(face, 0)], bodies.size), axis=0)
+
+    def add(edge: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
+        segments = edges.clipped(edge, exists)
+        # Of a body alone walks over its surface tell as much, and most edges have no other near.
+        long = jnp.max(abs(segments.ends[1] - segments.ends[0]), axis=0) > 2 * _NEAR
+        column, row = stored((segments.ends / _NEAR).astype(jnp.int32).swapaxes(0, 1))
+        near = seen_near[:, row, column]
+        face = jnp.max(segments.faces, axis=0)
+        wanted = long | are_others(face, near[:, 0]) | are_others(face, near[:, 1])
+        segments = segments._replace(parts=stored(jnp.where(wanted, segments.parts, 0)))
+        ends, cuts = edges.cuts(segments)
+
+        def add_cut(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            n, nearest, total = state
+            pieces = edges.pieces(segments, ends, n)
+            column, row = pieces.pixel
+            face, depth = stored_together(unpictured(pieces, segments, view.face_image))
+            wanted = stored((face >= 0) & are_others(face, seen[:, row, column]))
+            number = jnp.where(wanted, row * width + column, total.size)
+            nearest = nearest.at[number].max(depth, mode="drop")
+            best = jnp.where(depth < nearest[number], total.size, number)
+            total = total.at[best].set(-1, mode="drop").at[best].max(face, mode="drop")
+            return n + 1, nearest, total
+
+        def is_left(state: tuple[Array, Array, Array]) -> Array:
+            return anywhere(state[0] < cuts)
+
+        return lax.while_loop(is_left, add_cut, (ends[-1] & 0, *total))[1:]
+
+    nowhere = jnp.full(seen[0].size, -1, view.face_image.dtype) + (edges.count & 0)
+    nothing = nowhere.astype(view.positions_clip.dtype) + 1, nowhere
+    return over_batches(edges.order, edges.count, edges.at_once.edges, add, nothing)[1]
+
+
+def _drawn(view: View, method: Method) -> tuple[Array, Array]:
+    """The vertices in pixels, and the faces' volume: 0 where they are not drawn."""
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    pixels = stored(to_pixels(view.positions_clip, height, width))
+    volume = view.volume
+    assert volume is not None
+    if method.cull_backfaces:
+        front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
+        volume = stored(jnp.where(front, volume, 0))
+    return pixels, volume
+
+
+class _Edges:
+    """The edges of the mesh across which the picture may jump."""
+
+    def __init__(self, view: View, pixels: Array, volume: Array):
+        self.height, self.width = view.image.shape[0] - 2, view.image.shape[1] - 2
+        self.view, self.pixels, self.volume = view, pixels, volume
+        self.order, self.count = choose_edges(view.topology.edges, volume, view.apart)
+        self.z = stored(view.positions_clip[:, 2])
+        self.at_once = usual_batches(view.apart.size, self.height * self.width)
+
+    def clipped(self, edge: Array, exists: Array) -> Segments:
+        """Edges within the view."""
+        segments: Segments = clip_edges(
+            edge,
+            exists,
+            self.view.topology.edges,
+            self.view.faces,
+            self.pixels,
+            self.z,
+            self.volume,
+            height=self.height,
+            width=self.width,
+        )
+        return segments
+
+    def cuts(self, segments: Segments) -> tuple[Array, Array]:
+        """Sums of how many pieces edges have, and how many cuts make them."""
+        ends = prefix_sum(segments.parts)
+        return ends, batches_of(ends[-1], self.at_once.cut)
+
+    def pieces(self, segments: Segments, ends: Array, n: Array) -> Pieces:
+        """Those of a cut that may be seen."""
+        size = {"height": self.height, "width": self.width}
+        at_once = self.at_once.cut
+        pieces = cut(segments, ends, n * at_once, at_once=at_once, **size)
+        return uncovered(pieces, segments, self.view.faces, self.pixels, self.view.face_image)
 
 
 def _edges(
@@ -120,26 +211,17 @@ def _edges(
     goes_on: Callable[[Blended], Array] | None,
 ) -> Work:
     """The edges of the mesh; within a batch of them, too, only while `goes_on(total)`."""
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    edges = view.topology.edges
-    order, count = choose_edges(edges, volume, view.apart)
-    z = stored(view.positions_clip[:, 2])
+    edges = _Edges(view, pixels, volume)
     near_bare = near_background(view.face_image)
-    at_once = usual_batches(view.apart.size, height * width)
+    at_once = edges.at_once
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
-        segments = clip_edges(
-            edge, exists, edges, view.faces, pixels, z, volume, height=height, width=width
-        )
-        ends = prefix_sum(segments.parts)
-        cuts = batches_of(ends[-1], at_once.cut)
+        segments = edges.clipped(edge, exists)
+        ends, cuts = edges.cuts(segments)
 
         def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
             n, waiting = state
-            first = n * at_once.cut
-            pieces = cut(segments, ends, first, at_once=at_once.cut, height=height, width=width)
-            pieces = uncovered(pieces, segments, view.faces, pixels, view.face_image)
-            return n + 1, behind(waiting, *gathered(pieces))
+            return n + 1, behind(waiting, *gathered(edges.pieces(segments, ends, n)))
 
         def are_few(state: tuple[Array, Waiting]) -> Array:
             return (state[0] < cuts) & (state[1].total < at_once.pieces)
@@ -156,6 +238,7 @@ def _edges(
                 volume,
                 view.face_image,
                 near_bare,
+                view.unseen,
             )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
@@ -167,13 +250,14 @@ def _edges(
         start = ends[-1] & 0, none_waiting(segments, at_once.cut + at_once.pieces), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    return Work(order, count, at_once.edges, add_edges)
+    return Work(edges.order, edges.count, at_once.edges, add_edges)
 
 
-def _piercing(view: View, method: Method, pixels: Array, volume: Array, unseen: Array) -> Work:
+def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
     """The lines along which surfaces pierce each other."""
-    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    bodies, unseen, width = view.topology.bodies, view.unseen, view.image.shape[1] - 2
     assert bodies is not None
+    assert unseen is not None
     order, count = choose_pixels(view.face_image, bodies, unseen)
     lines_at_once = lanes() * LINES_AT_ONCE
 

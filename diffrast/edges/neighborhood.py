@@ -58,12 +58,21 @@ def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) 
 
 def near_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
     """Whether blocks of pixels, or those round them, hold an empty one."""
-    height, width = face_image.shape
-    bare = jnp.pad(face_image < 0, ((0, -height % _BLOCK), (0, -width % _BLOCK)))
-    rows = jnp.any(bare.reshape(-1, _BLOCK, bare.shape[1]), axis=1)
-    blocks = jnp.pad(jnp.any(rows.reshape(rows.shape[0], -1, _BLOCK), axis=2), 1)
-    near = blocks[:-2] | blocks[1:-1] | blocks[2:]
-    return near[:, :-2] | near[:, 1:-1] | near[:, 2:]
+    return largest_round(largest_of_blocks(face_image < 0, _BLOCK))
+
+
+def largest_of_blocks(values: Array, size: int) -> Array:
+    """The largest value of each block of so many rows and columns, none of which is negative."""
+    height, width = values.shape
+    values = jnp.pad(values, ((0, -height % size), (0, -width % size)))
+    rows = jnp.max(values.reshape(-1, size, values.shape[1]), axis=1)
+    return jnp.pad(jnp.max(rows.reshape(rows.shape[0], -1, size), axis=2), 1)
+
+
+def largest_round(values: Array) -> Array:
+    """The largest of 3×3 values each, of an image with a border of one, which is cut off."""
+    rows = jnp.maximum(jnp.maximum(values[:-2], values[1:-1]), values[2:])
+    return jnp.maximum(jnp.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
 
 
 def is_near_background(

@@ -3,9 +3,9 @@
 The 1/w of a plane is linear on the screen, and so is the difference of that of two faces: where it
 is zero they meet, along a straight line, with the one in front on this side and the other on that.
 The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
-faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, one of which an
-edge is visible in the pixel, but nothing at any of these centres, and the faces of two bodies that
-meet nearest to the centre, with those next to them. These two are found by walks over both surfaces
+faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, one that has an
+edge in the pixel, but is seen at none of these centres, and the faces of two bodies that meet
+nearest to the centre, with those next to them. These two are found by walks over both surfaces
 to where the planes meet that are known so far. Faces smaller than a pixel are too many to be cut
 with one another: the planes of these two stand for their surfaces in all of the pixel. A surface
 that pierces itself is not found.
@@ -29,6 +29,7 @@ from diffrast._stored import stored, stored_together, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import (
     first_row,
+    largest_round,
     least_row,
     only,
     picked,
@@ -99,16 +100,25 @@ def choose_pixels(
 ) -> tuple[Int[Array, " list"], Int[Array, ""]]:
     """Indices of the pixels round which two bodies are seen, in ascending order, and how many.
 
-    Also of those that show a face, `unseen`, only beside their centres; -1 where there is none.
+    Also of those that hold a face which is seen at no centre, `unseen`; -1 where there is none.
     """
     # Else all bodies would be looked up, and held, before there is anything unseen.
-    body = _body_of(face_image, bodies + zero_after(unseen[0]))
-    largest, least = body, jnp.where(body >= 0, body, jnp.iinfo(body.dtype).max)
-    largest = jnp.maximum(jnp.maximum(largest[:-2], largest[1:-1]), largest[2:])
-    largest = jnp.maximum(jnp.maximum(largest[:, :-2], largest[:, 1:-1]), largest[:, 2:])
-    least = jnp.minimum(jnp.minimum(least[:-2], least[1:-1]), least[2:])
-    least = jnp.minimum(jnp.minimum(least[:, :-2], least[:, 1:-1]), least[:, 2:])
-    return selected((largest > least).reshape(-1) | (unseen >= 0))
+    first, last = bodies_round(face_image, bodies + zero_after(unseen[0]))
+    return selected((first + last > bodies.size + 1).reshape(-1) | (unseen >= 0))
+
+
+def bodies_round(
+    face_image: Int[Array, "height_with_border width_with_border"], bodies: Int[Array, " F"]
+) -> Int[Array, "2 height width"]:
+    """Which bodies are seen at each pixel's 3×3: the largest of their `ranks`, 0 where none is."""
+    body = _body_of(face_image, bodies)
+    seen = stored(jnp.where(body >= 0, ranks(body, bodies.size), 0))
+    return stored(jnp.stack([largest_round(rank) for rank in seen]))
+
+
+def ranks(body: Int[Array, "*n"], count: int) -> Int[Array, "2 *n"]:
+    """Numbers of bodies counted from the first and from the last, from 1 on."""
+    return jnp.stack([body + 1, count - body])
 
 
 def _body_of(face: Array, bodies: Array) -> Array:

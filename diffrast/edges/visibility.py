@@ -1,7 +1,8 @@
 """What lies on the two sides of a piece of an edge, and which part of it can be seen.
 
-Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it and
-those round the edge itself. The first part of the piece is looked at here (see `parts`); what is
+Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
+those round the edge itself and, of several bodies, one that has an edge in the pixel but shows at
+none of these centres. The first part of the piece is looked at here (see `parts`); what is
 left of it becomes a piece of its own. Faces may be too thin for any pixel to show them: a walk over
 the surface that is seen nearby, and would hide the part if it reached it, tells whether it does.
 Where no candidate lies behind the part, walks over two surfaces at the pixels around, the one
@@ -58,7 +59,7 @@ _SMALL = 1e-6  # keeps a ratio of lengths finite
 
 BACKGROUND = -2
 # Which of the candidates, behind those at nine pixels, are next to an edge's first face, or second.
-_NEXT = np.zeros((2, 9 + 12, 1), bool)
+_NEXT = np.zeros((2, 9 + 12 + 1, 1), bool)
 _NEXT[0, [9, 11]] = _NEXT[1, [10, 12]] = True
 
 
@@ -78,7 +79,6 @@ class Seen(NamedTuple):
     fold: Bool[Array, " n"]
     front_on_right: Bool[Array, " n"]
     front: Side
-    unseen: Bool[Array, " n"]  # whether none of the 3×3 pixels shows the face in front
     beyond: Side
     rim: Rim
     wrong_side: Bool[Array, " n"]  # the centre lies on the edge and shows the face that front hides
@@ -128,6 +128,23 @@ def uncovered(
 
 
 @jax.jit
+def unpictured(
+    pieces: Pieces,
+    segments: Segments,
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """Faces of pieces' edges that none of the 3×3 pixels shows, or -1; and 1/w of the pieces."""
+    own, weights = stored_together(
+        (segments.faces[:, pieces.segment], segments.weights[:, pieces.segment])
+    )
+    pictured = pixels_round(face_image, *pieces.pixel)
+    shown = jnp.any(pictured[:, None] == own, axis=0)
+    face = jnp.max(jnp.where(shown | ~pieces.exists, -1, jnp.maximum(own, -1)), axis=0)
+    middle = (pieces.range[0] + pieces.range[1]) / 2
+    return face, weights[0] + middle * (weights[1] - weights[0])
+
+
+@jax.jit
 def look(
     pieces: Pieces,
     segments: Segments,
@@ -137,11 +154,12 @@ def look(
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
+    unseen: Int[Array, " pixels"] | None,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `near_bare` is its `near_background`.
+    one pixel all round; `near_bare` is its `near_background`, and `unseen` holds the `unpictured`.
     """
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
@@ -182,7 +200,9 @@ def look(
     undrawn = own < -1
     of_edge = jnp.where(undrawn, -2 - own, own)
     nearby = only(ring_of_edge(of_edge, topology.neighbors), volume != 0)
-    around = stored(jnp.concatenate([pictured, nearby]))
+    column, row = pieces.pixel
+    more = [] if unseen is None else [unseen[row * (face_image.shape[1] - 2) + column][None]]
+    around = stored(jnp.concatenate([pictured, nearby, *more]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
@@ -199,7 +219,8 @@ def look(
     tolerance = jnp.array(TOLERANCE, depth.dtype)
     tolerance = jnp.where(touching, FINE_TOLERANCE, tolerance)
     # Both sides of a face that is seen edge-on end in one place, and may be equally near.
-    across = (_NEXT[0] & undrawn[0]) | (_NEXT[1] & undrawn[1])
+    first, second = _NEXT[:, : len(around)]
+    across = (first & undrawn[0]) | (second & undrawn[1])
     tolerance = stored(jnp.where(across, 0, tolerance))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
     candidates = Candidates(
@@ -308,7 +329,7 @@ def look(
     least_share = lowest(barycentrics([value[1] for value in values]))[0]
     hidden = (least_share > FINE_TOLERANCE) & (ours != front)
     planes = jnp.stack([picked(depths, look) for look in looks]) - near
-    plain = (ours == front) | jnp.any(around[9:, None] == ours, axis=0)
+    plain = (ours == front) | jnp.any(around[9 : 9 + len(nearby), None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
 
     ways = jnp.stack([hiding, behind, other_behind, *jnp.where(alike & ~plain, ours, -1)])
@@ -380,7 +401,6 @@ def look(
         fold=fold,
         front_on_right=front_on_right,
         front=Side(front, [b[0] for b in beside], front_shown, is_front),
-        unseen=first_row(pictured == front) == 9,
         beyond=Side(beyond, [b[1] for b in beside], beyond_look, is_beyond & ~is_front),
         rim=rim,
         wrong_side=wrong_side,
