@@ -138,7 +138,9 @@ def test_boxes_in_a_row_have_no_seam(whole):
     smooth = jax.jit(lambda view: dr.render(scene, view, SETTINGS))
     settings = dataclasses.replace(SETTINGS, antialias=False, samples=24**2)
     sampled = jax.jit(lambda view: dr.render(scene, view, settings))
-    for eye in ((0, 5, 5), (5, 5, 5), (-5, 5, 5), (1.5, 3, 7)):
+    # From the last, a pixel of one box's edges holds a corner of the next that no pixel shows.
+    eyes = ((0, 5, 5), (5, 5, 5), (-5, 5, 5), (1.5, 3, 7), (-3.1, 7, 2))
+    for eye in eyes[:-1] if whole else eyes:
         place = {"eye": eye, "target": (0, 0, 0), "up": (0, 1, 0), "near": 0.1, "far": 20}
         near = dr.Camera.perspective(fov_y=0.8, **place)
         for view in (near, dr.Camera.orthographic(height=6, **place)):
