@@ -120,19 +120,17 @@ def test_outlines_at_faces_seen_edge_on_count_once(level):
 @pytest.mark.parametrize("whole", [False, True])
 def test_boxes_in_a_row_have_no_seam(whole):
     """The sides in which they touch are not seen, and nor are the edges of these."""
-    cube, places = dr.shapes.cube(), (-2.0, 0.0, 2.0)
+    cube = dr.shapes.cube()
+    moves = [dr.linalg.translation((x, 0, 0)) for x in (-2.0, 0.0, 2.0)]
     if whole:
-        count = np.arange(len(places))[:, None, None]
-        row = dr.Mesh(
-            vertices=np.concatenate([cube.vertices + np.array([x, 0, 0]) for x in places]),
-            faces=np.concatenate(cube.faces + count * len(cube.vertices)),
-            normals=np.tile(cube.normals, (len(places), 1)),
-        )
+        row = dr.mesh.merge([dr.mesh.transform(cube, move) for move in moves])
+        # Made anew its boxes hang together.
+        row = dr.Mesh(vertices=row.vertices, faces=row.faces, normals=row.normals)
         boxes = [dr.Object(row, dr.Material(diffuse=(0.8, 0.7, 0.5)))]
     else:
         boxes = [
-            dr.Object(cube, dr.Material(diffuse=color), dr.linalg.translation((x, 0, 0)))
-            for x, color in zip(places, np.eye(3), strict=True)
+            dr.Object(cube, dr.Material(diffuse=color), move)
+            for move, color in zip(moves, np.eye(3), strict=True)
         ]
     scene = dr.Scene(objects=boxes, lights=[dr.DirectionalLight(direction=(-0.3, -0.5, -1))])
     smooth = jax.jit(lambda view: dr.render(scene, view, SETTINGS))

@@ -142,7 +142,7 @@ def _place(view: View, pixel: Array, look: Array | int) -> Array:
     return (pixel[1] + row) * view.image.shape[1] + pixel[0] + column
 
 
-def _number(view: View, pixel: Array) -> Array:
+def number_of_pixel(view: View, pixel: Array) -> Array:
     """Index of pixels in the image without its border."""
     return pixel[1] * (view.image.shape[1] - 2) + pixel[0]
 
@@ -229,7 +229,7 @@ def with_pieces(
         own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         if view.meaned is not None:
-            meaned = stored(view.meaned.reshape(-1)[_number(view, pieces.pixel)])
+            meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
             first, second = (meaned & side.is_centre for side in (found.front, found.beyond))
             value = jnp.where(first, area * (behind - own), value)
             value = jnp.where(second, value + area * (own - behind), value)
@@ -304,7 +304,7 @@ def _with_values(
     held: Sequence[Float[Array, "channels n"]],
 ) -> tuple[Sums | None, Int[Array, " n"]]:
     """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
-    number = stored(jnp.where(used, _number(view, pixel), view.face_image.size))
+    number = stored(jnp.where(used, number_of_pixel(view, pixel), view.face_image.size))
     if total is None:
         return None, number
     added = total.added.at[number].add(stored(value).T, mode="drop")

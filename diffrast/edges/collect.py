@@ -19,6 +19,7 @@ from diffrast.edges.blend import (
     Method,
     View,
     nothing,
+    number_of_pixel,
     with_line,
     with_pieces,
     with_shadow,
@@ -55,7 +56,7 @@ from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import look, uncovered, unpictured
 
-_NEAR = 16  # pixels
+_NEAR = 16  # pixels: of a block, in which or next to which other bodies count as near
 
 Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
 
@@ -110,7 +111,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
 
 def unseen_faces(view: View, method: Method) -> Int[Array, " pixels"]:
     """What is to be the view's `unseen`: of several the nearest."""
-    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    bodies = view.topology.bodies
     assert bodies is not None
     edges = _Edges(view, *_drawn(view, method))
     seen = bodies_round(view.face_image, bodies)
@@ -137,7 +138,7 @@ def unseen_faces(view: View, method: Method) -> Int[Array, " pixels"]:
             column, row = pieces.pixel
             face, depth = stored_together(unpictured(pieces, segments, view.face_image))
             wanted = stored((face >= 0) & are_others(face, seen[:, row, column]))
-            number = jnp.where(wanted, row * width + column, total.size)
+            number = jnp.where(wanted, number_of_pixel(view, pieces.pixel), total.size)
             nearest = nearest.at[number].max(depth, mode="drop")
             best = jnp.where(depth < nearest[number], total.size, number)
             total = total.at[best].set(-1, mode="drop").at[best].max(face, mode="drop")
@@ -229,6 +230,9 @@ def _edges(
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
             pieces = first_ones(waiting, at_once)
+            unseen = view.unseen
+            if unseen is not None:
+                unseen = stored(unseen[number_of_pixel(view, pieces.pixel)])
             found, left = look(
                 pieces,
                 segments,
@@ -238,7 +242,7 @@ def _edges(
                 volume,
                 view.face_image,
                 near_bare,
-                view.unseen,
+                unseen,
             )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total

@@ -8,16 +8,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from diffrast._device import at_once, views_fill_lanes
-from diffrast._selection import compacted, over_batches
 from diffrast._stored import stored_together
-from diffrast.edges.neighborhood import first_row, picked, walk
+from diffrast.edges.neighborhood import first_row, over_few, picked, walk
 from diffrast.edges.planes import TOLERANCE, Table, corners_of, covers, edge_values
 
 _ASIDE = 0.02  # pixels from a crease to the points that show what hides its sides
 _RISES = 1e-4  # of 1/w a pixel: what hides a side recedes less, by so much at least
 _AT_ONCE = 256
-_SHARE = 4  # of so many pieces mostly one at most is a crease
 
 
 def buried(
@@ -78,6 +75,4 @@ def buried(
         found = (hides[0, 0] & here[0, 0]) | (hides[1, 1] & here[1, 1])
         return total.at[jnp.where(exists, way, crease.size)].set(found, mode="drop")
 
-    order, count = compacted(crease, jnp.arange(crease.size, dtype=jnp.int32))
-    some = -(-crease.size // _SHARE) if views_fill_lanes() else at_once(_AT_ONCE, crease.size)
-    return over_batches(order, count, some, look, crease & False)
+    return over_few(crease, _AT_ONCE, look, crease & False)

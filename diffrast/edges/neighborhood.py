@@ -1,6 +1,8 @@
 """What may lie near a piece of an edge: pixels round it, and faces round faces."""
 
+from collections.abc import Callable
 from functools import reduce
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +15,11 @@ from diffrast._stored import stored, stored_together
 from diffrast._topology import by_three
 from diffrast.edges.planes import Table, corners_of, covers, edge_values
 
+T = TypeVar("T")
+
 _STEPS = 40
 _WAYS_AT_ONCE = 512
-_SHARE = 4  # of so many places mostly one at most begins a way
+_SHARE = 4  # of so many mostly one at most is among a few
 _BLOCK = 4  # pixels
 
 
@@ -108,6 +112,19 @@ def turned_alike(face: Int[Array, "*n"], facing: Array, volume: Float[Array, " F
     return (face >= 0) & (volume[jnp.maximum(face, 0)] * facing > 0)
 
 
+def over_few(
+    chosen: Bool[Array, " n"],
+    some: int,
+    add: Callable[[Int[Array, " some"], Bool[Array, " some"], T], T],
+    start: T,
+) -> T:
+    """Fold `add(indices, exists, total)` over the few of many that are chosen, `some` at a time."""
+    size = chosen.size
+    order, count = compacted(chosen, jnp.arange(size, dtype=jnp.int32))
+    some = -(-size // _SHARE) if views_fill_lanes() else at_once(some, size)
+    return over_batches(order, count, some, add, start)
+
+
 def walk(
     face: Int[Array, "*ways"],
     x: Float[Array, "*ways"],
@@ -122,8 +139,7 @@ def walk(
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or
     turns away. Also whether the end of the way was reached.
     """
-    shape, number = face.shape, jnp.arange(face.size, dtype=jnp.int32)
-    order, count = compacted((face >= 0).reshape(-1), number)
+    shape = face.shape
     face, x, y = stored_together((face.reshape(-1), x.reshape(-1), y.reshape(-1)))
 
     def go(way: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -155,6 +171,5 @@ def walk(
         return ends.at[place].set(end, mode="drop"), arrived.at[place].set(there, mode="drop")
 
     nowhere = jnp.minimum(face, -1), face < 0
-    some = -(-face.size // _SHARE) if views_fill_lanes() else at_once(_WAYS_AT_ONCE, face.size)
-    ends, arrived = over_batches(order, count, some, go, nowhere)
+    ends, arrived = over_few(face >= 0, _WAYS_AT_ONCE, go, nowhere)
     return ends.reshape(shape), arrived.reshape(shape)

@@ -154,12 +154,13 @@ def look(
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
-    unseen: Int[Array, " pixels"] | None,
+    unseen: Int[Array, " n"] | None,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `near_bare` is its `near_background`, and `unseen` holds the `unpictured`.
+    one pixel all round; `near_bare` is its `near_background`. `unseen` is one more face of each
+    pixel, see `View`.
     """
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
@@ -200,8 +201,7 @@ def look(
     undrawn = own < -1
     of_edge = jnp.where(undrawn, -2 - own, own)
     nearby = only(ring_of_edge(of_edge, topology.neighbors), volume != 0)
-    column, row = pieces.pixel
-    more = [] if unseen is None else [unseen[row * (face_image.shape[1] - 2) + column][None]]
+    more = [] if unseen is None else [unseen[None]]
     around = stored(jnp.concatenate([pictured, nearby, *more]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
