@@ -53,13 +53,18 @@ def compacted(
     return jnp.zeros_like(values).at[slot].set(values, mode="drop"), ends[-1]
 
 
-def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, ""]]:
+def selected(
+    mask: Bool[Array, " n"],
+    holds: Callable[[Int[Array, " some"]], Bool[Array, " some"]] | None = None,
+) -> tuple[Int[Array, " more"], Int[Array, ""]]:
     """Indices of what is true, ascending, and how many; the list is a little longer than the mask.
 
     On a CPU blocks in which something is true are found first, and only these are looked through.
+    So what takes longer to find out is asked only there: whether it `holds`, too, at such indices.
     """
     if not draws_on_cpu():
-        return compacted(mask, jnp.arange(mask.size, dtype=jnp.int32))
+        indices = jnp.arange(mask.size, dtype=jnp.int32)
+        return compacted(mask if holds is None else mask & holds(indices), indices)
     count = -(-mask.size // _BLOCK)
     blocks = stored(
         jnp.pad(mask, (0, count * _BLOCK - mask.size)).reshape(count, _BLOCK).astype(jnp.int8)
@@ -70,9 +75,9 @@ def selected(mask: Bool[Array, " n"]) -> tuple[Int[Array, " more"], Int[Array, "
 
     def add(block: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         indices, total = state
-        chosen = (blocks[block] > 0) & exists[:, None]
-        number = block[:, None] * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)
-        more, added = compacted(chosen.reshape(-1), number.reshape(-1))
+        chosen = ((blocks[block] > 0) & exists[:, None]).reshape(-1)
+        number = (block[:, None] * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)).reshape(-1)
+        more, added = compacted(chosen if holds is None else chosen & holds(number), number)
         return lax.dynamic_update_slice(indices, more, (total,)), total + added
 
     zero = zero_after(block_count)

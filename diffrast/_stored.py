@@ -128,6 +128,23 @@ def zero_after(witness: Array) -> Array:
     return stored(jnp.zeros((), witness.dtype), witness)
 
 
+def looked_up(truths: Array, witness: Array) -> Array:
+    """Store what is read at places that other arrays name, often more than once, on a CPU.
+
+    Where nothing else wants them XLA would find them out again at every reading, divisions or not:
+    so they come out of a loop of one step, of which it does not know that. Of the witness, a
+    number, it is made that there is one.
+    """
+    if not draws_on_cpu():
+        return truths
+    one = 1 + zero_after(witness)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        return state[0] + 1, truths
+
+    return lax.while_loop(lambda state: state[0] < one, step, (one - 1, truths & False))[1]
+
+
 @jax.custom_jvp
 def stored_alone(value: Array) -> Array:
     """Store an array, and leave its derivative to whatever takes it: no pass over it is added."""

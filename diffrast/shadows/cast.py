@@ -9,7 +9,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import over_views
-from diffrast._stored import stored
+from diffrast._stored import looked_up, stored
 from diffrast._topology import Edges
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, ShiningLight, casts_shadow
@@ -153,7 +153,8 @@ def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool
     inside_out = jnp.zeros(normal.shape[0], bool)
     if geometry.normals is not None:
         inside_out = dot(normal, jnp.sum(geometry.normals[geometry.faces], axis=1)) < 0
-    return jnp.where(inside_out, -1, 1) * dot(normal, place[:3] - place[3] * corner) > 0
+    outside = jnp.where(inside_out, -1, 1) * dot(normal, place[:3] - place[3] * corner) > 0
+    return looked_up(outside, corner[0, 0])
 
 
 def _reached(

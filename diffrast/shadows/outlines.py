@@ -111,39 +111,52 @@ def _between_pixels(
     lit: Bool[Array, "lights height width"],
 ) -> Int[Array, "lights 2 height width"]:
     height, width = points.face.shape
-    pairs = _pairs(topology, points, lit)
-    order, count = selected(pairs.reshape(-1))
     face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
     barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
 
-    def look(number: Array, exists: Array, edges: Array) -> Array:
+    def dark_and_bright(number: Array) -> tuple[Array, Array, Array]:
+        """The lights and the pixels of pairs."""
         pair, at = divided(number, height * width)
         lamp, is_below = divided(pair, 2)
         next_at = at + jnp.where(is_below == 0, 1, width)
         is_lit = bright[lamp, at]
-        ends = jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
-        dark, bright_end = (Points(face[i], list(barycentrics[:, i]), at) for i in stored(ends))
-        asked = exists & lamps.turned[lamp, dark.face]
-        edge = _edge_between(lamps, lamp, asked, pictures, geometry, topology, dark, bright_end)
+        return lamp, jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
+
+    def is_asked(number: Array) -> Array:
+        """Whether both show one surface, at the dark one turned to the light."""
+        lamp, *ends = dark_and_bright(number)
+        dark, bright_end = (face[end] for end in ends)
+        one_surface = topology.patches[dark] == topology.patches[bright_end]
+        return (jnp.minimum(dark, bright_end) >= 0) & one_surface & lamps.turned[lamp, dark]
+
+    differs = _side_by_side(lit, jnp.not_equal)
+    order, count = selected(differs.reshape(-1), is_asked)
+
+    def look(number: Array, exists: Array, edges: Array) -> Array:
+        lamp, *ends = dark_and_bright(number)
+        dark, bright_end = (Points(face[i], list(barycentrics[:, i]), i) for i in stored(ends))
+        edge = _edge_between(lamps, lamp, exists, pictures, geometry, topology, dark, bright_end)
         place = jnp.where(exists, number, edges.size)
         return edges.at[place].set(edge, mode="drop")
 
-    none = jnp.full(pairs.size, -1, jnp.int32) + zero_after(count)
-    return over_batches(order, count, lanes() * _AT_ONCE, look, none).reshape(pairs.shape)
+    none = jnp.full(differs.size, -1, jnp.int32) + zero_after(count)
+    return over_batches(order, count, lanes() * _AT_ONCE, look, none).reshape(differs.shape)
 
 
-def _pairs(
-    topology: Topology, points: Points, lit: Bool[Array, "lights height width"]
-) -> Bool[Array, "lights 2 height width"]:
-    """Whether a pixel and that on its right, or below it, show one surface, one of them lit."""
-    patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
-    right = (lit[:, :, 1:] != lit[:, :, :-1]) & (patch[:, 1:] == patch[:, :-1])
-    below = (lit[:, 1:] != lit[:, :-1]) & (patch[1:] == patch[:-1])
+def _side_by_side(
+    images: Shaped[Array, "*images height width"], compare: Callable[[Array, Array], Array]
+) -> Bool[Array, "*images 2 height width"]:
+    """What comparing pixels with those on their right, and those below them, says; else false."""
     right, below = (
-        jnp.pad(right, ((0, 0), (0, 0), (0, 1))),
-        jnp.pad(below, ((0, 0), (0, 1), (0, 0))),
+        compare(images[..., 1:], images[..., :-1]),
+        compare(images[..., 1:, :], images[..., :-1, :]),
     )
-    return jnp.stack([right, below], axis=1)
+    none = [(0, 0)] * (images.ndim - 2)
+    right, below = (
+        jnp.pad(right, [*none, (0, 0), (0, 1)]),
+        jnp.pad(below, [*none, (0, 1), (0, 0)]),
+    )
+    return jnp.stack([right, below], axis=-3)
 
 
 def parted(
@@ -160,7 +173,8 @@ def parted(
     pixels = to_pixels(positions_clip, *points.face.shape)
     volume = facing(pixels, geometry.faces)
     shadowed = ~lit & shone_on(lights, shadows, geometry, points)
-    one_surface = _pairs(topology, points, lit)
+    patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
+    one_surface = _side_by_side(patch, jnp.equal) & _side_by_side(lit, jnp.not_equal)
 
     def is_parted(turned: Array, dark: Array, pairs: Array, edges: Array) -> Array:
         pairs = pairs & (dark | _next_to(dark))
