@@ -96,6 +96,17 @@ def test_values_and_derivatives_are_finite(case):
             assert np.all(np.isfinite(leaf))
 
 
+def test_a_mesh_without_edges_shows_nothing():
+    """Faces of one vertex each have none."""
+    mesh = dr.Mesh(vertices=[(0, 0, 0), (1, 0, 0)], faces=[[0, 0, 0], [1, 1, 1]])
+    light = dr.DirectionalLight(direction=(0, -1, 0), shadow=dr.Shadow(resolution=8))
+    scene = dr.Scene(objects=[dr.Object(mesh)], lights=[light], background=(0.1, 0.2, 0.3))
+    view, sizes = camera((0.3, 2.0, 3.0)), dr.RenderSettings(height=8, width=8)
+    image, change = jax.jvp(lambda view: dr.render(scene, view, sizes), (view,), (view,))
+    np.testing.assert_array_equal(image, np.tile(np.float32(scene.background), (8, 8, 1)))
+    np.testing.assert_array_equal(change, np.zeros((8, 8, 3)))
+
+
 @pytest.mark.parametrize("level", [1, 2])
 def test_outlines_at_faces_seen_edge_on_count_once(level):
     """Both sides of such a face end in one place, and hardly one behind the other."""

@@ -170,6 +170,8 @@ def antialias_image(
         glow: likewise; needed if the view has shadows.
         cull_backfaces: whether only front faces are drawn.
     """
+    if not view.apart.size:  # faces of one vertex each
+        return view.image[1:-1, 1:-1]
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
     capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 10 / ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
