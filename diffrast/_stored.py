@@ -13,6 +13,7 @@ maximum of themselves and of a padding that is the least there is. Of that nothi
 but one loop, vectorised, in which what they have in common is computed once.
 """
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -128,21 +129,26 @@ def zero_after(witness: Array) -> Array:
     return stored(jnp.zeros((), witness.dtype), witness)
 
 
+def stepped(step: Callable[[Array], Array], start: Array, witness: Array) -> Array:
+    """What a step makes of `start`, in a loop of one, of which XLA does not know that it is one.
+
+    It looks through divisions, conditions it can decide and loops it can count, but not through
+    this. Of the witness, a number that it does not know, it is made that there is one step.
+    """
+    one = 1 + zero_after(witness)
+
+    def counted(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        return state[0] + 1, step(state[1])
+
+    return lax.while_loop(lambda state: state[0] < one, counted, (one - 1, start))[1]
+
+
 def looked_up(truths: Array, witness: Array) -> Array:
     """Store what is read at places that other arrays name, often more than once, on a CPU.
 
-    Where nothing else wants them XLA would find them out again at every reading, divisions or not:
-    so they come out of a loop of one step, of which it does not know that. Of the witness, a
-    number, it is made that there is one.
+    Where nothing else wants them XLA would find them out again at every reading, divisions or not.
     """
-    if not draws_on_cpu():
-        return truths
-    one = 1 + zero_after(witness)
-
-    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        return state[0] + 1, truths
-
-    return lax.while_loop(lambda state: state[0] < one, step, (one - 1, truths & False))[1]
+    return stepped(lambda _: truths, truths & False, witness) if draws_on_cpu() else truths
 
 
 @jax.custom_jvp

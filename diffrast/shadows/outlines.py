@@ -147,15 +147,11 @@ def _side_by_side(
     images: Shaped[Array, "*images height width"], compare: Callable[[Array, Array], Array]
 ) -> Bool[Array, "*images 2 height width"]:
     """What comparing pixels with those on their right, and those below them, says; else false."""
-    right, below = (
-        compare(images[..., 1:], images[..., :-1]),
-        compare(images[..., 1:, :], images[..., :-1, :]),
-    )
+    right = compare(images[..., 1:], images[..., :-1])
+    below = compare(images[..., 1:, :], images[..., :-1, :])
     none = [(0, 0)] * (images.ndim - 2)
-    right, below = (
-        jnp.pad(right, [*none, (0, 0), (0, 1)]),
-        jnp.pad(below, [*none, (0, 1), (0, 0)]),
-    )
+    right = jnp.pad(right, [*none, (0, 0), (0, 1)])
+    below = jnp.pad(below, [*none, (0, 1), (0, 0)])
     return jnp.stack([right, below], axis=-3)
 
 
