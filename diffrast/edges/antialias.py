@@ -1,6 +1,5 @@
 """The stage that gives an image its edges; see `blend` for the method."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -173,7 +172,7 @@ def antialias_image(
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
     height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
-    capacity = ROWS_AT_ONCE * max(4, math.ceil(height * width / 10 / ROWS_AT_ONCE))
+    capacity = ROWS_AT_ONCE * max(4, height * width // (10 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
     if view.topology.bodies is not None:

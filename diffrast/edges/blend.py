@@ -27,7 +27,7 @@ from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, light_told
-from diffrast.edges.visibility import BACKGROUND, Seen
+from diffrast.edges.visibility import BACKGROUND, Seen, Unseen
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 _SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
@@ -53,9 +53,7 @@ class View(NamedTuple):
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
-    # Where there are several bodies: a face that has an edge in the pixel, but is seen at no centre
-    # round it, where another body is; or -1.
-    unseen: Int[Array, " pixels"] | None = None
+    unseen: Unseen | None = None  # where there are several bodies
 
 
 class Method(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, lanes
 from diffrast._selection import batches_of, divided, over_batches, prefix_sum
@@ -24,7 +24,7 @@ from diffrast.edges.blend import (
     with_pieces,
     with_shadow,
 )
-from diffrast.edges.neighborhood import largest_of_blocks, largest_round, near_background
+from diffrast.edges.neighborhood import near_background
 from diffrast.edges.pieces import (
     Pieces,
     Segments,
@@ -54,10 +54,9 @@ from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
 from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
-from diffrast.edges.visibility import look, uncovered, unpictured
+from diffrast.edges.visibility import Unseen, look, uncovered, unpictured
 
-_NEAR = 16  # pixels: of a block, in which or next to which other bodies count as near
-
+Nearest = tuple[Float[Array, " pixels"], Int[Array, " pixels"]]  # 1/w of faces, and which
 Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
 
 
@@ -109,49 +108,49 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     return blended
 
 
-def unseen_faces(view: View, method: Method) -> Int[Array, " pixels"]:
-    """What is to be the view's `unseen`: of several the nearest."""
+def unseen_faces(view: View, method: Method) -> Unseen:
+    """What is to be the view's `unseen`."""
     bodies = view.topology.bodies
     assert bodies is not None
     edges = _Edges(view, *_drawn(view, method))
     seen = bodies_round(view.face_image, bodies)
-    seen_near = jnp.stack([largest_round(largest_of_blocks(rank, _NEAR)) for rank in seen])
 
-    def are_others(face: Array, seen: Array) -> Array:
-        """Whether bodies that are seen are others than that of faces."""
-        return jnp.any(seen > ranks(bodies[jnp.maximum(face, 0)], bodies.size), axis=0)
-
-    def add(edge: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
+    def add(edge: Array, exists: Array, total: tuple[Nearest, Nearest]) -> tuple[Nearest, Nearest]:
         segments = edges.clipped(edge, exists)
-        # Of a body alone walks over its surface tell as much, and most edges have no other near.
-        long = jnp.max(abs(segments.ends[1] - segments.ends[0]), axis=0) > 2 * _NEAR
-        column, row = stored((segments.ends / _NEAR).astype(jnp.int32).swapaxes(0, 1))
-        near = seen_near[:, row, column]
-        face = jnp.max(segments.faces, axis=0)
-        wanted = long | are_others(face, near[:, 0]) | are_others(face, near[:, 1])
-        segments = segments._replace(parts=stored(jnp.where(wanted, segments.parts, 0)))
         ends, cuts = edges.cuts(segments)
 
-        def add_cut(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            n, nearest, total = state
+        def add_cut(state: tuple[Array, Nearest, Nearest]) -> tuple[Array, Nearest, Nearest]:
+            n, near, far = state
             pieces = edges.pieces(segments, ends, n)
             column, row = pieces.pixel
             face, depth = stored_together(unpictured(pieces, segments, view.face_image))
-            wanted = stored((face >= 0) & are_others(face, seen[:, row, column]))
-            number = jnp.where(wanted, number_of_pixel(view, pieces.pixel), total.size)
-            nearest = nearest.at[number].max(depth, mode="drop")
-            best = jnp.where(depth < nearest[number], total.size, number)
-            total = total.at[best].set(-1, mode="drop").at[best].max(face, mode="drop")
-            return n + 1, nearest, total
+            body = ranks(bodies[jnp.maximum(face, 0)], bodies.size)
+            other = jnp.any(seen[:, row, column] > body, axis=0)
+            pixel = number_of_pixel(view, pieces.pixel)
+            near = _nearer(near, pixel, stored((face >= 0) & other), face, depth)
+            far = _nearer(far, pixel, face >= 0, face, -depth)
+            return n + 1, near, far
 
-        def is_left(state: tuple[Array, Array, Array]) -> Array:
+        def is_left(state: tuple[Array, Nearest, Nearest]) -> Array:
             return anywhere(state[0] < cuts)
 
         return lax.while_loop(is_left, add_cut, (ends[-1] & 0, *total))[1:]
 
     nowhere = jnp.full(seen[0].size, -1, view.face_image.dtype) + (edges.count & 0)
-    nothing = nowhere.astype(view.positions_clip.dtype) + 1, nowhere
-    return over_batches(edges.order, edges.count, edges.at_once.edges, add, nothing)[1]
+    nothing = nowhere.astype(view.positions_clip.dtype) - jnp.inf, nowhere
+    found = over_batches(edges.order, edges.count, edges.at_once.edges, add, (nothing, nothing))
+    # Held by all that follows: numbers of few faces take two bytes.
+    few = jnp.int16 if bodies.size <= jnp.iinfo(jnp.int16).max else jnp.int32
+    return Unseen(*(face.astype(few).reshape(seen.shape[1:]) for _, face in found))
+
+
+def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Array) -> Nearest:
+    """The nearest in each pixel, of what was before and of the faces that are wanted."""
+    nearest, known = best
+    number = jnp.where(wanted, pixel, known.size)
+    nearest = nearest.at[number].max(depth, mode="drop")
+    number = jnp.where(depth < nearest[number], known.size, number)
+    return nearest, known.at[number].set(-1, mode="drop").at[number].max(face, mode="drop")
 
 
 def _drawn(view: View, method: Method) -> tuple[Array, Array]:
@@ -230,9 +229,6 @@ def _edges(
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
             pieces = first_ones(waiting, at_once)
-            unseen = view.unseen
-            if unseen is not None:
-                unseen = stored(unseen[number_of_pixel(view, pieces.pixel)])
             found, left = look(
                 pieces,
                 segments,
@@ -242,7 +238,7 @@ def _edges(
                 volume,
                 view.face_image,
                 near_bare,
-                unseen,
+                view.unseen,
             )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
@@ -259,9 +255,10 @@ def _edges(
 
 def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
     """The lines along which surfaces pierce each other."""
-    bodies, unseen, width = view.topology.bodies, view.unseen, view.image.shape[1] - 2
+    bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
-    assert unseen is not None
+    assert view.unseen is not None
+    unseen = view.unseen.nearest.reshape(-1)
     order, count = choose_pixels(view.face_image, bodies, unseen)
     lines_at_once = lanes() * LINES_AT_ONCE
 
@@ -275,7 +272,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
             view.topology,
             volume,
             view.face_image,
-            stored(unseen[number]),
+            stored(unseen[number].astype(jnp.int32)),
         )
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:

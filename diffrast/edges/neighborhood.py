@@ -18,7 +18,7 @@ from diffrast.edges.planes import Table, corners_of, covers, edge_values
 T = TypeVar("T")
 
 _STEPS = 40
-_WAYS_AT_ONCE = 512
+_WAYS_AT_ONCE = 256
 _SHARE = 4  # of so many mostly one at most is among a few
 _BLOCK = 4  # pixels
 

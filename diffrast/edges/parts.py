@@ -58,7 +58,12 @@ def first_part(candidates: Candidates, fold: Bool[Array, " n"]) -> Part:
     left = jnp.max(jnp.where(reaches & (low <= other[0]), high, 0), axis=0)
     entered = jnp.min(jnp.where(reaches & (high >= one[0]), low, 1), axis=0)
     change = jnp.where(ends_first, left, entered)
-    changes = fold & (one[2] != other[2])
+    # Where nothing lies behind at first, the first surface that does may lie between these places.
+    exists = candidates.foreign & (low < high) & (low > begin + _SLIVER)
+    first = jnp.min(jnp.where(exists, low, 1), axis=0)
+    enters = stored((surface[0] < 0) & (first < end - _SLIVER))
+    change = jnp.where(enters, first, change)
+    changes = fold & (enters | (one[2] != other[2]))
     changes = changes & (change > begin + _SLIVER) & (change < end - _SLIVER)
     return Part(*stored_together((begin, jnp.where(changes, change, end), last)))
 

@@ -1,12 +1,13 @@
 """What lies on the two sides of a piece of an edge, and which part of it can be seen.
 
 Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
-those round the edge itself and, of several bodies, one that has an edge in the pixel but shows at
+those round the edge itself and, of several bodies, two that have an edge in the pixel but show at
 none of these centres. The first part of the piece is looked at here (see `parts`); what is
 left of it becomes a piece of its own. Faces may be too thin for any pixel to show them: a walk over
 the surface that is seen nearby, and would hide the part if it reached it, tells whether it does.
 Where no candidate lies behind the part, walks over two surfaces at the pixels around, the one
-beyond first, tell which of their faces does, or that both end before.
+beyond first, tell which of their faces does, or that both end before. Where only one is seen, the
+second may be one that no centre shows.
 """
 
 from typing import NamedTuple
@@ -59,8 +60,15 @@ _SMALL = 1e-6  # keeps a ratio of lengths finite
 
 BACKGROUND = -2
 # Which of the candidates, behind those at nine pixels, are next to an edge's first face, or second.
-_NEXT = np.zeros((2, 9 + 12 + 1, 1), bool)
+_NEXT = np.zeros((2, 9 + 12 + 2, 1), bool)
 _NEXT[0, [9, 11]] = _NEXT[1, [10, 12]] = True
+
+
+class Unseen(NamedTuple):
+    """Faces that have an edge in a pixel, but are seen at no centre of the 3×3 round it; or -1."""
+
+    nearest: Int[Array, "height width"]  # of other bodies than those seen there
+    farthest: Int[Array, "height width"]  # of any
 
 
 class Side(NamedTuple):
@@ -154,13 +162,13 @@ def look(
     volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
-    unseen: Int[Array, " n"] | None,
+    unseen: Unseen | None,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `near_bare` is its `near_background`. `unseen` is one more face of each
-    pixel, see `View`.
+    one pixel all round; `near_bare` is its `near_background`. `unseen` are two more faces of each
+    pixel.
     """
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
@@ -201,7 +209,7 @@ def look(
     undrawn = own < -1
     of_edge = jnp.where(undrawn, -2 - own, own)
     nearby = only(ring_of_edge(of_edge, topology.neighbors), volume != 0)
-    more = [] if unseen is None else [unseen[None]]
+    more = [] if unseen is None else [_at(part, *pieces.pixel)[None] for part in unseen]
     around = stored(jnp.concatenate([pictured, nearby, *more]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
@@ -288,7 +296,8 @@ def look(
     front_look, beyond_look = stored_together((front_look, beyond_look))
     tiny = stored(area(around_corners[:, :, :9])) < _FINE
     before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
-    above = tiny & before
+    # The surface in front may come nearer inwards: only another one lies above its rim.
+    above = tiny & before & (patch[:9] != front_patch)
     visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
 
     # Walks over the surface to the point just beyond: from where a surface is seen that would hide
@@ -313,6 +322,11 @@ def look(
     behind = stored(jnp.where(crease, last, behind))
     others = search & after & (patch[:9] != topology.patches[jnp.maximum(behind, 0)])
     other_behind = _seen_nearest(others, pictured, points[1])
+    if unseen is not None:
+        farthest = unseen.farthest
+        last = _last_unseen(farthest, pieces.pixel, beyond_look, front_patch, topology.patches)
+        last = jnp.where(search & (last != own[0]) & (last != own[1]), last, -1)
+        other_behind = jnp.where(other_behind < 0, last, other_behind)
 
     # And two to the point just inside, from pixels that show the surface in front, or another part
     # of it that folds before or behind: where it is not plain that this one comes nearer inwards.
@@ -426,6 +440,21 @@ def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Arra
     same = (face >= 0) & (patch == patches[jnp.maximum(face, 0)])
     first = first_row(same)
     return jnp.where(picked(same, look) | (first == 9), look, first)
+
+
+def _at(image: Int[Array, "height width"], column: Array, row: Array) -> Int[Array, " n"]:
+    """The values of an image at pixels, or at the nearest ones that it has."""
+    height, width = image.shape
+    return stored(image[row.clip(0, height - 1), column.clip(0, width - 1)].astype(jnp.int32))
+
+
+def _last_unseen(
+    farthest: Array, pixel: Array, look: Array, front_patch: Array, patches: Array
+) -> Array:
+    """The farthest unseen face of a pixel or, if that is of the surface in front, of the next."""
+    here, there = _at(farthest, *pixel), _at(farthest, *(pixel + steps_to(look)))
+    other = (here >= 0) & (patches[jnp.maximum(here, 0)] != front_patch)
+    return jnp.where(other | (there < 0), here, there)
 
 
 def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
