@@ -231,11 +231,13 @@ def look(
     across = (first & undrawn[0]) | (second & undrawn[1])
     tolerance = stored(jnp.where(across, 0, tolerance))
     margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
+    # What joins a front face that is thinner than that begins where the edge is, and hides nothing.
+    joined = jnp.where(use_first, first, second) & (thickness < outside)
     candidates = Candidates(
         face=around,
         patch=patch,
         foreign=foreign,
-        hides=[*(value[0] for value in values), margin[0]],
+        hides=[*(value[0] for value in values), jnp.where(joined, -1, margin[0])],
         behind=[*(value[1] for value in values), -margin[1]],
         inverse_depth=depth[1],
     )
@@ -295,10 +297,13 @@ def look(
     beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
     front_look, beyond_look = stored_together((front_look, beyond_look))
     tiny = stored(area(around_corners[:, :, :9])) < _FINE
+    same = patch[:9] == front_patch
     before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
-    # The surface in front may come nearer inwards: only another one lies above its rim.
-    above = tiny & before & (patch[:9] != front_patch)
-    visible = visible & ~(picked(above, front_look) & picked(above, beyond_look))
+    # The surface in front may come nearer inwards, where another one is seen beyond.
+    above = tiny & before
+    looks = jnp.stack([front_look, beyond_look])
+    above, ours = (jnp.stack([picked(part, look) for look in looks]) for part in (above, same))
+    visible = visible & ~(above[0] & above[1] & (ours[0] == ours[1]))
 
     # Walks over the surface to the point just beyond: from where a surface is seen that would hide
     # the piece if it reached it; and where nothing is found behind, or one is seen that would lie
