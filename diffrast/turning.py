@@ -24,7 +24,7 @@ from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, third_corner
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.bending import Chosen, Turning, bending
-from diffrast.edges.neighborhood import walk
+from diffrast.edges.neighborhood import Surface, walk
 from diffrast.edges.pieces import to_pixels
 from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
 from diffrast.geometry import Points, points_at
@@ -169,7 +169,7 @@ def _faces_at(
     def find(found: Array) -> Array:
         pixels = stored(to_pixels(clip, height, width))
         neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
-        surface = faces, pixels, neighbors, volume
+        surface = Surface(faces, pixels, topology._replace(neighbors=neighbors), volume)
 
         def add(n: Array, found: Array) -> Array:
             place, exists, part = _parts(chosen, n, count)
@@ -181,7 +181,9 @@ def _faces_at(
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
             covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             own = jnp.broadcast_to(centre, x.shape)
-            ends, there = walk(stored(jnp.where(covered, -1, own)), x, y, *surface)
+            # Beyond a fold, to which a way might lead round its end, edges tell what is seen.
+            start = stored(jnp.where(covered, -1, own))
+            ends, there = walk(start, x, y, surface, straight=True)
             seen = stored(jnp.where(covered, own, jnp.where(there, ends, -1)))
             right, down = stored(jnp.asarray(_ASIDE)[:, :, part])
             beside = stored(face_image[row + 1 + down, column + 1 + right])
@@ -202,7 +204,7 @@ def _unhidden(
     beside: Int[Array, "points parts"],
     point: tuple[Array, Array],
     centre: tuple[Array, Array],
-    surface: tuple[Array, Array, Array, Array],
+    surface: Surface,
 ) -> Int[Array, "points parts"]:
     """What is seen at points, -1 where the surface that the next pixel shows lies before that.
 
@@ -228,7 +230,7 @@ def _unhidden(
 
         may_hide = exists & is_before(other, centre_x, centre_y)
         start = stored(jnp.where(may_hide, other, -1))
-        end, there = walk(start, x, y, *surface)
+        end, there = walk(start, x, y, surface)
         hidden = there & (end >= 0) & is_before(end, x, y, FINE_TOLERANCE)
         return seen.at[jnp.where(hidden, number, seen.size)].set(-1, mode="drop")
 

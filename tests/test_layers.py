@@ -55,6 +55,7 @@ ORDER = [
     "diffrast.edges.neighborhood",
     "diffrast.edges.rim",
     "diffrast.edges.creases",
+    "diffrast.edges.ways",
     "diffrast.edges.visibility",
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_lines",

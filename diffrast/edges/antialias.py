@@ -175,9 +175,8 @@ def antialias_image(
     capacity = ROWS_AT_ONCE * max(4, height * width // (10 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
-    if view.topology.bodies is not None:
-        find = over_views(lambda view: unseen_faces(view, method), height * width)
-        view = view._replace(unseen=find(lax.stop_gradient(view)))
+    find = over_views(lambda view: unseen_faces(view, method), height * width)
+    view = view._replace(unseen=find(lax.stop_gradient(view)))
 
     def gather(view: View, method: Method) -> Blended:
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)

@@ -53,7 +53,7 @@ class View(NamedTuple):
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
-    unseen: Unseen | None = None  # where there are several bodies
+    unseen: Unseen | None = None
 
 
 class Method(NamedTuple):

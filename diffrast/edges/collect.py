@@ -24,7 +24,7 @@ from diffrast.edges.blend import (
     with_pieces,
     with_shadow,
 )
-from diffrast.edges.neighborhood import near_background
+from diffrast.edges.neighborhood import Surface, near_background
 from diffrast.edges.pieces import (
     Pieces,
     Segments,
@@ -74,7 +74,7 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
 
     With `start`, the `following` of earlier records, only those are made that begin there.
     """
-    pixels, volume = _drawn(view, method)
+    surface = _surface(view, method)
 
     def is_wanted(total: Blended) -> Array:
         assert total.records is not None
@@ -82,8 +82,8 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
 
     goes_on = None if start is None else is_wanted
     # Shadows first: what they are found by need not be held any longer, then.
-    work = [] if view.cast is None else [_shadows(view, view.cast, method, pixels)]
-    work.append(_edges(view, method, pixels, volume, goes_on))
+    work = [] if view.cast is None else [_shadows(view, view.cast, method, surface)]
+    work.append(_edges(view, method, surface, goes_on))
     # Else what it is added to would be made, and held, before the image and the first list are.
     zero = stored(zero_after(work[0].size), view.image[0, 0, 0])
 
@@ -104,44 +104,47 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     for part in work:
         blended, passed = with_batches(blended, passed, part)
     if view.topology.bodies is not None:
-        blended, _ = with_batches(blended, passed, _piercing(view, method, pixels, volume))
+        blended, _ = with_batches(blended, passed, _piercing(view, method, surface))
     return blended
 
 
 def unseen_faces(view: View, method: Method) -> Unseen:
     """What is to be the view's `unseen`."""
     bodies = view.topology.bodies
-    assert bodies is not None
-    edges = _Edges(view, *_drawn(view, method))
-    seen = bodies_round(view.face_image, bodies)
+    edges = _Edges(view, _surface(view, method))
+    seen = None if bodies is None else bodies_round(view.face_image, bodies)
 
-    def add(edge: Array, exists: Array, total: tuple[Nearest, Nearest]) -> tuple[Nearest, Nearest]:
+    def add(edge: Array, exists: Array, total: list[Nearest]) -> list[Nearest]:
         segments = edges.clipped(edge, exists)
         ends, cuts = edges.cuts(segments)
 
-        def add_cut(state: tuple[Array, Nearest, Nearest]) -> tuple[Array, Nearest, Nearest]:
-            n, near, far = state
+        def add_cut(state: tuple[Array, list[Nearest]]) -> tuple[Array, list[Nearest]]:
+            n, (far, *near) = state
             pieces = edges.pieces(segments, ends, n)
-            column, row = pieces.pixel
-            face, depth = stored_together(unpictured(pieces, segments, view.face_image))
-            body = ranks(bodies[jnp.maximum(face, 0)], bodies.size)
-            other = jnp.any(seen[:, row, column] > body, axis=0)
+            face, depth = stored_together(
+                unpictured(pieces, segments, edges.surface.volume, view.face_image)
+            )
             pixel = number_of_pixel(view, pieces.pixel)
-            near = _nearer(near, pixel, stored((face >= 0) & other), face, depth)
-            far = _nearer(far, pixel, face >= 0, face, -depth)
-            return n + 1, near, far
+            if bodies is not None and seen is not None:
+                column, row = pieces.pixel
+                body = ranks(bodies[jnp.maximum(face, 0)], bodies.size)
+                other = jnp.any(seen[:, row, column] > body, axis=0)
+                near = [_nearer(near[0], pixel, stored((face >= 0) & other), face, depth)]
+            return n + 1, [_nearer(far, pixel, face >= 0, face, -depth), *near]
 
-        def is_left(state: tuple[Array, Nearest, Nearest]) -> Array:
+        def is_left(state: tuple[Array, list[Nearest]]) -> Array:
             return anywhere(state[0] < cuts)
 
-        return lax.while_loop(is_left, add_cut, (ends[-1] & 0, *total))[1:]
+        return lax.while_loop(is_left, add_cut, (ends[-1] & 0, total))[1]
 
-    nowhere = jnp.full(seen[0].size, -1, view.face_image.dtype) + (edges.count & 0)
+    size = edges.height, edges.width
+    nowhere = jnp.full(edges.height * edges.width, -1, view.face_image.dtype) + (edges.count & 0)
     nothing = nowhere.astype(view.positions_clip.dtype) - jnp.inf, nowhere
-    found = over_batches(edges.order, edges.count, edges.at_once.edges, add, (nothing, nothing))
+    start = [nothing] * (1 if bodies is None else 2)
+    found = over_batches(edges.order, edges.count, edges.at_once.edges, add, start)
     # Held by all that follows: numbers of few faces take two bytes.
-    few = jnp.int16 if bodies.size <= jnp.iinfo(jnp.int16).max else jnp.int32
-    return Unseen(*(face.astype(few).reshape(seen.shape[1:]) for _, face in found))
+    few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
+    return Unseen(*(stored(face.astype(few)).reshape(size) for _, face in found))
 
 
 def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Array) -> Nearest:
@@ -153,8 +156,8 @@ def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Arra
     return nearest, known.at[number].set(-1, mode="drop").at[number].max(face, mode="drop")
 
 
-def _drawn(view: View, method: Method) -> tuple[Array, Array]:
-    """The vertices in pixels, and the faces' volume: 0 where they are not drawn."""
+def _surface(view: View, method: Method) -> Surface:
+    """The faces whose edges are looked for, with their vertices in pixels."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     pixels = stored(to_pixels(view.positions_clip, height, width))
     volume = view.volume
@@ -162,16 +165,16 @@ def _drawn(view: View, method: Method) -> tuple[Array, Array]:
     if method.cull_backfaces:
         front = (volume < 0) if view.turned is None else (volume < 0) != view.turned
         volume = stored(jnp.where(front, volume, 0))
-    return pixels, volume
+    return Surface(view.faces, pixels, view.topology, volume)
 
 
 class _Edges:
     """The edges of the mesh across which the picture may jump."""
 
-    def __init__(self, view: View, pixels: Array, volume: Array):
+    def __init__(self, view: View, surface: Surface):
         self.height, self.width = view.image.shape[0] - 2, view.image.shape[1] - 2
-        self.view, self.pixels, self.volume = view, pixels, volume
-        self.order, self.count = choose_edges(view.topology.edges, volume, view.apart)
+        self.view, self.surface = view, surface
+        self.order, self.count = choose_edges(view.topology.edges, surface.volume, view.apart)
         self.z = stored(view.positions_clip[:, 2])
         self.at_once = usual_batches(view.apart.size, self.height * self.width)
 
@@ -180,11 +183,11 @@ class _Edges:
         segments: Segments = clip_edges(
             edge,
             exists,
-            self.view.topology.edges,
-            self.view.faces,
-            self.pixels,
+            self.surface.topology.edges,
+            self.surface.faces,
+            self.surface.pixels,
             self.z,
-            self.volume,
+            self.surface.volume,
             height=self.height,
             width=self.width,
         )
@@ -200,20 +203,22 @@ class _Edges:
         size = {"height": self.height, "width": self.width}
         at_once = self.at_once.cut
         pieces = cut(segments, ends, n * at_once, at_once=at_once, **size)
-        return uncovered(pieces, segments, self.view.faces, self.pixels, self.view.face_image)
+        return uncovered(
+            pieces, segments, self.surface.faces, self.surface.pixels, self.view.face_image
+        )
 
 
 def _edges(
     view: View,
     method: Method,
-    pixels: Array,
-    volume: Array,
+    surface: Surface,
     goes_on: Callable[[Blended], Array] | None,
 ) -> Work:
     """The edges of the mesh; within a batch of them, too, only while `goes_on(total)`."""
-    edges = _Edges(view, pixels, volume)
+    edges = _Edges(view, surface)
     near_bare = near_background(view.face_image)
-    at_once = edges.at_once
+    at_once, unseen = edges.at_once, view.unseen
+    assert unseen is not None
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = edges.clipped(edge, exists)
@@ -229,17 +234,7 @@ def _edges(
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = lax.while_loop(are_few, add_cut, state[:2])
             pieces = first_ones(waiting, at_once)
-            found, left = look(
-                pieces,
-                segments,
-                view.faces,
-                pixels,
-                view.topology,
-                volume,
-                view.face_image,
-                near_bare,
-                view.unseen,
-            )
+            found, left = look(pieces, segments, surface, view.face_image, near_bare, unseen)
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
 
@@ -253,11 +248,12 @@ def _edges(
     return Work(edges.order, edges.count, at_once.edges, add_edges)
 
 
-def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
+def _piercing(view: View, method: Method, surface: Surface) -> Work:
     """The lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
     assert view.unseen is not None
+    assert view.unseen.nearest is not None
     unseen = view.unseen.nearest.reshape(-1)
     order, count = choose_pixels(view.face_image, bodies, unseen)
     lines_at_once = lanes() * LINES_AT_ONCE
@@ -267,10 +263,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
         crossings = cross(
             pixel,
             exists,
-            view.faces,
-            pixels,
-            view.topology,
-            volume,
+            surface,
             view.face_image,
             stored(unseen[number].astype(jnp.int32)),
         )
@@ -284,7 +277,7 @@ def _piercing(view: View, method: Method, pixels: Array, volume: Array) -> Work:
     return Work(order, count, lanes() * PIXELS_AT_ONCE, add_pixels)
 
 
-def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
+def _shadows(view: View, cast: Cast, method: Method, surface: Surface) -> Work:
     """The outlines of shadows."""
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
     order, count = choose_shadowed(cast)
@@ -292,14 +285,20 @@ def _shadows(view: View, cast: Cast, method: Method, pixels: Array) -> Work:
 
     def add_pixels(number: Array, exists: Array, total: Blended) -> Blended:
         light, place = divided(number, width * height)
-        weight_of_light = pixels.shape[1] - cast.weight.size + light
+        weight_of_light = surface.pixels.shape[1] - cast.weight.size + light
         places = Places(
             light,
             rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
             pixel=jnp.stack(divided(place, width)[::-1]),
         )
         outlines = cross_shadows(
-            places, exists, cast, view.faces, view.topology.neighbors, pixels, view.face_image
+            places,
+            exists,
+            cast,
+            view.faces,
+            view.topology.neighbors,
+            surface.pixels,
+            view.face_image,
         )
 
         def add_lines(line: Array, exists: Array, total: Blended) -> Blended:

@@ -9,8 +9,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored_together
-from diffrast.edges.neighborhood import first_row, over_few, picked, walk
-from diffrast.edges.planes import TOLERANCE, Table, corners_of, covers, edge_values
+from diffrast.edges.neighborhood import Surface, first_row, over_few, picked, walk
+from diffrast.edges.planes import TOLERANCE, corners_of, covers, edge_values
 
 _ASIDE = 0.02  # pixels from a crease to the points that show what hides its sides
 _RISES = 1e-4  # of 1/w a pixel: what hides a side recedes less, by so much at least
@@ -24,10 +24,7 @@ def buried(
     near: Float[Array, " n"],
     own: Int[Array, "2 n"],
     around: Int[Array, "candidates n"],
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    neighbors: Int[Array, "F 3"],
-    volume: Float[Array, " F"],
+    surface: Surface,
 ) -> Bool[Array, " n"]:
     """Whether a surface that begins at a crease, and is seen around it, hides one of its sides.
 
@@ -38,11 +35,9 @@ def buried(
         near: 1/w at the point.
         own: the two faces.
         around: faces seen near it; -1 where there is nothing.
-        faces: corners.
-        pixels: vertices.
-        neighbors: faces next to faces.
-        volume: of faces as in `facing`, 0 where they are not drawn.
+        surface: all faces.
     """
+    faces, pixels, _, _ = surface
 
     def look(way: Array, exists: Array, total: Array) -> Array:
         place, outward, depth, face, others = stored_together(
@@ -70,7 +65,7 @@ def buried(
             start = picked(others, jnp.minimum(best, len(others) - 1))
             starts.append(jnp.where(exists & (best < len(others)), start, -1))
         # It may be seen where another one of its faces lies.
-        reached, _ = walk(jnp.stack(starts), x, y, faces, pixels, neighbors, volume)
+        reached, _ = walk(jnp.stack(starts), x, y, surface)
         hides, here = may_hide(reached)
         found = (hides[0, 0] & here[0, 0]) | (hides[1, 1] & here[1, 1])
         return total.at[jnp.where(exists, way, crease.size)].set(found, mode="drop")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import reduce
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from diffrast._device import anywhere, at_once, in_strides, views_fill_lanes
 from diffrast._selection import compacted, divided, over_batches
 from diffrast._stored import stored, stored_together
-from diffrast._topology import by_three
+from diffrast._topology import Topology, by_three
 from diffrast.edges.planes import Table, corners_of, covers, edge_values
 
 T = TypeVar("T")
@@ -20,7 +20,16 @@ T = TypeVar("T")
 _STEPS = 40
 _WAYS_AT_ONCE = 256
 _SHARE = 4  # of so many mostly one at most is among a few
-_BLOCK = 4  # pixels
+_BLOCK = 4  # rows and columns of pixels
+
+
+class Surface(NamedTuple):
+    """The faces of a scene on the screen, and how they hang together."""
+
+    faces: Int[Array, "F 3"]
+    pixels: Table
+    topology: Topology
+    volume: Float[Array, " F"]  # that of `facing`, but 0 for faces that are not drawn
 
 
 def picked(values: Array, index: Array) -> Array:
@@ -62,15 +71,15 @@ def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) 
 
 def near_background(face_image: Int[Array, "height width"]) -> Bool[Array, "rows columns"]:
     """Whether blocks of pixels, or those round them, hold an empty one."""
-    return largest_round(largest_of_blocks(face_image < 0, _BLOCK))
+    return largest_round(_largest_of_blocks(face_image < 0))
 
 
-def largest_of_blocks(values: Array, size: int) -> Array:
-    """The largest value of each block of so many rows and columns, none of which is negative."""
+def _largest_of_blocks(values: Array) -> Array:
+    """The largest value of each block, none of which is negative; with a border of one block."""
     height, width = values.shape
-    values = jnp.pad(values, ((0, -height % size), (0, -width % size)))
-    rows = jnp.max(values.reshape(-1, size, values.shape[1]), axis=1)
-    return jnp.pad(jnp.max(rows.reshape(rows.shape[0], -1, size), axis=2), 1)
+    values = jnp.pad(values, ((0, -height % _BLOCK), (0, -width % _BLOCK)))
+    rows = jnp.max(values.reshape(-1, _BLOCK, values.shape[1]), axis=1)
+    return jnp.pad(jnp.max(rows.reshape(rows.shape[0], -1, _BLOCK), axis=2), 1)
 
 
 def largest_round(values: Array) -> Array:
@@ -129,17 +138,18 @@ def walk(
     face: Int[Array, "*ways"],
     x: Float[Array, "*ways"],
     y: Float[Array, "*ways"],
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    neighbors: Int[Array, "F 3"],
-    volume: Float[Array, " F"],
+    surface: Surface,
+    *,
+    straight: bool = False,
 ) -> tuple[Int[Array, "*ways"], Bool[Array, "*ways"]]:
     """The faces that cover points, found from other faces on ways towards these.
 
     From face to face across edges beyond which the point lies; -1 if the surface ends before, or
-    turns away. Also whether the end of the way was reached.
+    turns away: everywhere, or, of a `straight` way, where the point lies farthest beyond. Also
+    whether the end of the way was reached.
     """
     shape = face.shape
+    faces, pixels, topology, volume = surface
     face, x, y = stored_together((face.reshape(-1), x.reshape(-1), y.reshape(-1)))
 
     def go(way: Array, exists: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -149,12 +159,14 @@ def walk(
         def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             steps, face, there = state
             values, _ = edge_values(corners_of(face, faces, pixels), to_x, to_y)
-            beside = stored(neighbors.T[:, jnp.maximum(face, 0)])
+            beside = stored(topology.neighbors.T[:, jnp.maximum(face, 0)])
             # One by one: rows of what is looked up for all three take twice the time.
             goes_on = [turned_alike(one, facing, volume) for one in beside]
-            aside = [jnp.where(goes_on[i], jnp.minimum(values[i], 0), 0) for i in range(3)]
+            aside = [jnp.minimum(value, 0) for value in values]
+            if not straight:
+                aside = [jnp.where(goes_on[i], aside[i], 0) for i in range(3)]
             least = reduce(jnp.minimum, aside)
-            best = [(value < 0) & (value == least) for value in aside]
+            best = [(aside[i] < 0) & (aside[i] == least) & goes_on[i] for i in range(3)]
             following = reduce(jnp.maximum, [jnp.where(best[i], beside[i], -1) for i in range(3)])
             there = there | (face < 0) | covers(values)
             return steps + 1, *stored_together((jnp.where(there, face, following), there))

@@ -26,8 +26,8 @@ from jaxtyping import Bool, Float, Int
 from diffrast._device import anywhere
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together, zero_after
-from diffrast._topology import Topology
 from diffrast.edges.neighborhood import (
+    Surface,
     first_row,
     largest_round,
     least_row,
@@ -130,10 +130,7 @@ def _body_of(face: Array, bodies: Array) -> Array:
 def cross(
     pixel: Int[Array, "2 n"],
     exists: Bool[Array, " n"],
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    topology: Topology,
-    volume: Float[Array, " F"],
+    surface: Surface,
     face_image: Int[Array, "height_with_border width_with_border"],
     unseen: Int[Array, " n"],
 ) -> Crossings:
@@ -142,9 +139,7 @@ def cross(
     Those that reach into the pixel, and whose planes meet within it. `unseen` is one more face of
     each pixel, or -1.
     """
-    planes, unit, met = _candidates(
-        pixel, exists, faces, pixels, topology, volume, face_image, unseen
-    )
+    planes, unit, met = _candidates(pixel, exists, surface, face_image, unseen)
     value, *slopes = planes.lambdas
     reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
     near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
@@ -162,14 +157,12 @@ def cross(
 def _candidates(
     pixel: Array,
     exists: Array,
-    faces: Array,
-    pixels: Table,
-    topology: Topology,
-    volume: Array,
+    surface: Surface,
     face_image: Array,
     unseen: Array,
 ) -> tuple[_Planes, Array, Array]:
     """Faces at pixels, the unit of their 1/w, and whether those in rows 0 and 1 meet."""
+    faces, pixels, topology, drawn = surface
     assert topology.bodies is not None
     pictured = stored(pixels_round(face_image, *pixel))
     face = pictured[_NEAREST_FIRST]
@@ -181,9 +174,9 @@ def _candidates(
     differ = picked(body, rows[0]) != picked(body, rows[1])
     at = jnp.asarray(_NEAREST_FIRST)[rows]
     of_pair = jnp.take_along_axis(seen_planes, rows[None], axis=1, mode="promise_in_bounds")
-    pair, met = _meeting(pixel, pair, of_pair, at, exists & differ, faces, pixels, topology, volume)
+    pair, met = _meeting(pixel, pair, of_pair, at, exists & differ, surface)
     nearby = topology.neighbors[jnp.maximum(pair, 0)].transpose(0, 2, 1).reshape(6, -1)
-    others = jnp.concatenate([pair, only(nearby, volume != 0), unseen[None]])
+    others = jnp.concatenate([pair, only(nearby, drawn != 0), unseen[None]])
     of_others = _lambdas(pixel, others, faces, pixels)
 
     def joined(other: Array, seen: Array) -> Array:
@@ -228,15 +221,13 @@ def _meeting(
     planes: Array,
     look: Array,
     exists: Array,
-    faces: Array,
-    pixels: Table,
-    topology: Topology,
-    volume: Array,
+    surface: Surface,
 ) -> tuple[Array, Array]:
     """Two faces where the surfaces of two others meet next to the pixel's centre; if they do.
 
     `planes` (3, 2, n) are those of `pair`, as in `_two_bodies`, and `look` is where it is seen.
     """
+    faces, pixels, topology, _ = surface
     centre = (pixel.astype(pixels.dtype) + 0.5)[:, None]
     from_centre = steps_to(look)
 
@@ -250,7 +241,7 @@ def _meeting(
         to = jnp.where(arrived, point[:, None], (point[:, None] + from_centre) / 2)
         x, y = stored(centre + to)
         ways = jnp.where(searched, pair, -1)
-        reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
+        reached, there = walk(ways, x, y, surface)
         now = there & (reached >= 0)
         reached = stored(jnp.where(now, reached, pair))
         following = meet(_sums(_lambdas(pixel, reached, faces, pixels)[0]))

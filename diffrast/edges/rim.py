@@ -7,8 +7,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import picked, pixel_at, steps_to, turned_alike
-from diffrast.edges.planes import Columns, Table, barycentrics, corners_of, edge_values, locate
+from diffrast.edges.neighborhood import Surface, picked, pixel_at, steps_to, turned_alike
+from diffrast.edges.planes import Columns, barycentrics, corners_of, edge_values, locate
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
@@ -61,10 +61,7 @@ def look_inwards(
     across: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
     centre: Float[Array, "2 n"],
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    neighbors: Int[Array, "F 3"],
-    volume: Float[Array, " F"],
+    surface: Surface,
 ) -> Rim:
     """What the faces in front show from the middle of pieces inwards.
 
@@ -78,11 +75,9 @@ def look_inwards(
         across: from the piece's begin to its end.
         inward: unit normal towards the face in front.
         centre: of the pixel, on the screen.
-        faces: corners of faces.
-        pixels: see `to_pixels`.
-        neighbors: of faces.
-        volume: see `look`.
+        surface: all faces.
     """
+    faces, pixels, topology, volume = surface
     depth, inner = inwards
     step = steps_to(inner)
     next_face = stored(picked(pictured, inner))
@@ -94,7 +89,7 @@ def look_inwards(
     bend = [jnp.clip(b[0], 0, 1) for b in at]
     # Where the face ends, a narrow one may fold again.
     known, out = jnp.maximum(front, 0), jnp.argmin(jnp.stack(bend), axis=0)
-    following = turned_alike(neighbors[known, out], jnp.sign(volume[known]), volume)
+    following = turned_alike(topology.neighbors[known, out], jnp.sign(volume[known]), volume)
     goes_on = (thickness >= depth) | following
     x, y = centre + step - BESIDE * inward
     beside = barycentrics(edge_values(corners_of(next_face, faces, pixels), x, y)[0])

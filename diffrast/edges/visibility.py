@@ -1,13 +1,13 @@
 """What lies on the two sides of a piece of an edge, and which part of it can be seen.
 
 Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
-those round the edge itself and, of several bodies, two that have an edge in the pixel but show at
-none of these centres. The first part of the piece is looked at here (see `parts`); what is
-left of it becomes a piece of its own. Faces may be too thin for any pixel to show them: a walk over
-the surface that is seen nearby, and would hide the part if it reached it, tells whether it does.
-Where no candidate lies behind the part, walks over two surfaces at the pixels around, the one
-beyond first, tell which of their faces does, or that both end before. Where only one is seen, the
-second may be one that no centre shows.
+those round the edge itself, and of those that have an edge in the pixel but show at none of these
+centres the farthest and, of several bodies, the nearest of another one. The first part of the piece
+is looked at here (see `parts`); what is left of it becomes a piece of its own. Faces may be too
+thin for any pixel to show them: a walk over the surface that is seen nearby, and would hide the
+part if it reached it, tells whether it does. Where no candidate lies behind the part, walks over
+two surfaces at the pixels around, the one beyond first, tell which of their faces does, or that
+both end before. Where only one is seen, the second may be one that no centre shows.
 """
 
 from typing import NamedTuple
@@ -19,19 +19,18 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored, stored_together
-from diffrast._topology import Topology, third_corner
+from diffrast._topology import third_corner
 from diffrast.edges.creases import buried
 from diffrast.edges.neighborhood import (
+    Surface,
     first_row,
     is_near_background,
-    least_row,
     only,
     picked,
     pixel_at,
     pixels_round,
     ring_of_edge,
     steps_to,
-    walk,
 )
 from diffrast.edges.parts import Candidates, first_part, nearest_behind
 from diffrast.edges.pieces import Pieces, Segments
@@ -41,34 +40,32 @@ from diffrast.edges.planes import (
     Columns,
     Table,
     area,
-    barycentrics,
     corners_of,
     covers,
     edge_values,
     inverse_depth_slope,
-    lowest,
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
+from diffrast.edges.ways import LOOK, Spot, inwards, outwards, sides_of, walked
 
 _BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
 _ROUNDINGS = 8  # of a position, if that is more
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
-_LOOK = 0.75  # pixels from the edge to a point whose pixel's centre lies on its side: > sqrt(1/2)
-_PLAIN = 0.7  # of what comes nearer from a rim to a pixel: its plane's share, 0.5 on a sphere
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
 BACKGROUND = -2
-# Which of the candidates, behind those at nine pixels, are next to an edge's first face, or second.
-_NEXT = np.zeros((2, 9 + 12 + 2, 1), bool)
+_FARTHEST = 9 + 12  # which of the candidates, behind those at nine pixels, is the unseen one
+# Which of them are next to an edge's first face, or second.
+_NEXT = np.zeros((2, _FARTHEST + 2, 1), bool)
 _NEXT[0, [9, 11]] = _NEXT[1, [10, 12]] = True
 
 
 class Unseen(NamedTuple):
     """Faces that have an edge in a pixel, but are seen at no centre of the 3×3 round it; or -1."""
 
-    nearest: Int[Array, "height width"]  # of other bodies than those seen there
-    farthest: Int[Array, "height width"]  # of any
+    farthest: Int[Array, "height width"]
+    nearest: Int[Array, "height width"] | None = None  # of other bodies than those seen there
 
 
 class Side(NamedTuple):
@@ -139,15 +136,23 @@ def uncovered(
 def unpictured(
     pieces: Pieces,
     segments: Segments,
+    volume: Float[Array, " F"],
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """Faces of pieces' edges that none of the 3×3 pixels shows, or -1; and 1/w of the pieces."""
+    """Faces of pieces' edges that none of the 3×3 pixels shows, or -1; and 1/w of the pieces.
+
+    Not one that turns away beside one that shows its front: of a closed body it cannot be seen.
+    """
     own, weights = stored_together(
         (segments.faces[:, pieces.segment], segments.weights[:, pieces.segment])
     )
     pictured = pixels_round(face_image, *pieces.pixel)
+    drawn = own >= 0
+    away = drawn & (volume[jnp.maximum(own, 0)] >= 0)
+    closed_in = away & (drawn & ~away)[::-1]
     shown = jnp.any(pictured[:, None] == own, axis=0)
-    face = jnp.max(jnp.where(shown | ~pieces.exists, -1, jnp.maximum(own, -1)), axis=0)
+    first, second = jnp.where(drawn & ~closed_in & ~shown & pieces.exists, own, -1)
+    face = jnp.maximum(first, second)
     middle = (pieces.range[0] + pieces.range[1]) / 2
     return face, weights[0] + middle * (weights[1] - weights[0])
 
@@ -156,20 +161,16 @@ def unpictured(
 def look(
     pieces: Pieces,
     segments: Segments,
-    faces: Int[Array, "F 3"],
-    pixels: Table,
-    topology: Topology,
-    volume: Float[Array, " F"],
+    surface: Surface,
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
-    unseen: Unseen | None,
+    unseen: Unseen,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
-    `volume` is that of `facing`, but 0 for faces that are not drawn; `face_image` has a border of
-    one pixel all round; `near_bare` is its `near_background`. `unseen` are two more faces of each
-    pixel.
+    `face_image` has a border of one pixel all round; `near_bare` is its `near_background`.
     """
+    faces, pixels, topology, volume = surface
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
         (
             segments.faces[:, pieces.segment],
@@ -209,8 +210,9 @@ def look(
     undrawn = own < -1
     of_edge = jnp.where(undrawn, -2 - own, own)
     nearby = only(ring_of_edge(of_edge, topology.neighbors), volume != 0)
-    more = [] if unseen is None else [_at(part, *pieces.pixel)[None] for part in unseen]
-    around = stored(jnp.concatenate([pictured, nearby, *more]))
+    farthest = _at(unseen.farthest, *pieces.pixel)
+    more = [farthest] if unseen.nearest is None else [farthest, _at(unseen.nearest, *pieces.pixel)]
+    around = stored(jnp.concatenate([pictured, nearby, jnp.stack(more)]))
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
@@ -262,10 +264,7 @@ def look(
         near,
         jnp.stack([front, other]),
         around,
-        faces,
-        pixels,
-        topology.neighbors,
-        volume,
+        surface,
     )
     visible = visible & ~hidden
 
@@ -293,93 +292,54 @@ def look(
         (begin - shift * normal, end - shift * normal, centre_depth)
     )
     beyond_centre = centre_depth < 0
-    front_look = jnp.where(beyond_centre, pixel_at(middle, out, -_LOOK), 4)
-    beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, _LOOK))
+    front_look = jnp.where(beyond_centre, pixel_at(middle, out, -LOOK), 4)
+    beyond_look = jnp.where(beyond_centre, 4, pixel_at(middle, out, LOOK))
     front_look, beyond_look = stored_together((front_look, beyond_look))
     tiny = stored(area(around_corners[:, :, :9])) < _FINE
-    same = patch[:9] == front_patch
     before = foreign[:9] & (depths > near * (1 + FINE_TOLERANCE))
     # The surface in front may come nearer inwards, where another one is seen beyond.
-    above = tiny & before
-    looks = jnp.stack([front_look, beyond_look])
-    above, ours = (jnp.stack([picked(part, look) for look in looks]) for part in (above, same))
-    visible = visible & ~(above[0] & above[1] & (ours[0] == ours[1]))
-
-    # Walks over the surface to the point just beyond: from where a surface is seen that would hide
-    # the piece if it reached it; and where nothing is found behind, or one is seen that would lie
-    # before that, from what is seen beyond or, if that does not fit, from the nearest one that
-    # does. If its surface ends before, so does the nearest other one, nothing else was found, and
-    # there are empty pixels not far away, the background is bare. What hides an edge that is no
-    # fold is mostly the other side of its own body, so its second walk starts from what is seen
-    # last before it.
-    least = stored(jnp.where(found, nearest * (1 + FINE_TOLERANCE), -jnp.inf))
-    after = foreign[:9] & (depths < near * (1 - FINE_TOLERANCE)) & (depths > least)
-    search = fold & (~found | jnp.any(after, axis=0))
-    crease = ~fold & ~jnp.any((pictured == own[0]) | (pictured == own[1]), axis=0)
-    bare = pictured < 0
-    shown = picked(pictured, beyond_look)
-    masks = jnp.stack([(fold | crease) & before, search & after])
-    points = jnp.stack([middle, middle + _LOOK * out])
-    hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
-    last = _seen_least(crease & before, pictured, depths)
-    shown_fits = picked(after, beyond_look) | (behind < 0)
-    behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
-    behind = stored(jnp.where(crease, last, behind))
-    others = search & after & (patch[:9] != topology.patches[jnp.maximum(behind, 0)])
-    other_behind = _seen_nearest(others, pictured, points[1])
-    if unseen is not None:
-        farthest = unseen.farthest
-        last = _last_unseen(farthest, pieces.pixel, beyond_look, front_patch, topology.patches)
-        last = jnp.where(search & (last != own[0]) & (last != own[1]), last, -1)
-        other_behind = jnp.where(other_behind < 0, last, other_behind)
-
-    # And two to the point just inside, from pixels that show the surface in front, or another part
-    # of it that folds before or behind: where it is not plain that this one comes nearer inwards.
-    inwards = next_inwards(middle, -out)
-    looks = jnp.stack([front_look, inwards[1]])
-    ours = stored(jnp.stack([picked(pictured, look) for look in looks]))
-    alike = jnp.stack([picked(patch, look) for look in looks]) == front_patch
-    alike = alike & fold & (ours >= 0)
-    x, y = centre[:, None] + steps_to(looks)
-    both = jnp.stack([ours, jnp.broadcast_to(front, ours.shape)])
-    values, inverse_depths = edge_values(corners_of(both, faces, pixels), x, y)
-    ahead = inverse_depths[0] - near
-    # Where the face in front reaches a centre that shows another one, it is hidden there.
-    least_share = lowest(barycentrics([value[1] for value in values]))[0]
-    hidden = (least_share > FINE_TOLERANCE) & (ours != front)
-    planes = jnp.stack([picked(depths, look) for look in looks]) - near
-    plain = (ours == front) | jnp.any(around[9 : 9 + len(nearby), None] == ours, axis=0)
-    plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
-
-    ways = jnp.stack([hiding, behind, other_behind, *jnp.where(alike & ~plain, ours, -1)])
-    away = jnp.stack([outside * out] * 3 + [-jnp.minimum(inside, thickness / 2) * out] * 2, axis=1)
-    ways, (x, y) = stored_together(
-        (jnp.where(visible, ways, -1), (centre + middle)[:, None] + away)
+    above, of_front = (
+        [picked(part, side) for side in (front_look, beyond_look)]
+        for part in (tiny & before, patch[:9] == front_patch)
     )
-    reached, there = walk(ways, x, y, faces, pixels, topology.neighbors, volume)
-    arrives = there & (reached >= 0)
-    reached_depth = edge_values(corners_of(reached, faces, pixels), x, y)[1]
-    in_front = reached_depth > near * (1 + FINE_TOLERANCE)
-    touches = ~in_front[3:] & (reached_depth[3:] > near * (1 - FINE_TOLERANCE))
-    connected = plain | (arrives[3:] & (touches | (reached[3:] == front)))
-    connected = connected & alike & ~hidden
-    hides = arrives[:3] & (reached[:3] != own[0]) & (reached[:3] != own[1]) & in_front[:3]
-    visible = visible & ~hides[0] & ~hides[1]
-    lies = search & arrives[1:3] & ~hides[1:] & (reached_depth[1:3] > least)
-    nearer_lies = lies & (reached_depth[1:3] >= jnp.where(lies, reached_depth[1:3], 0)[::-1])
-    stops = search & ~found & there[1] & (reached[1] < 0) & (shown >= 0) & ~lies[1]
-    # Held: combined once more for each of their uses they are no vector code.
-    connected, lies, nearer_lies, visible, stops = stored_together(
-        (connected, lies, nearer_lies, visible, stops)
+    visible = visible & ~(above[0] & above[1] & (of_front[0] == of_front[1]))
+
+    spot = Spot(
+        centre=centre,
+        middle=middle,
+        out=out,
+        near=near,
+        fold=fold,
+        own=own,
+        front=front,
+        front_patch=front_patch,
+        pictured=pictured,
+        patch=patch[:9],
+        foreign=foreign[:9],
+        depths=depths,
+        front_look=front_look,
+        beyond_look=beyond_look,
     )
-    gap = stops & is_near_background(near_bare, *pieces.pixel)
-    beyond = jnp.where(nearer_lies[0], reached[1], jnp.where(lies[1], reached[2], beyond))
+    # The farthest unseen one, or that of the next pixel if it is of the same surface.
+    next_farthest = _at(unseen.farthest, *(pieces.pixel + steps_to(beyond_look)))
+    is_other = (farthest >= 0) & (patch[_FARTHEST] != front_patch)
+    farthest = jnp.where(is_other | (next_farthest < 0), farthest, next_farthest)
+    rim_depth, inner = next_inwards(middle, -out)
+    walks = walked(
+        spot,
+        visible,
+        outwards(spot, nearest, farthest, surface),
+        inwards(spot, inner, nearby, surface),
+        (jnp.minimum(inside, thickness / 2), outside),
+        surface,
+    )
+    visible = visible & ~walks.hidden
+    # Where nothing is found, and there are empty pixels not far away, the background is bare.
+    gap = walks.ends & is_near_background(near_bare, *pieces.pixel)
+    beyond = jnp.where(walks.behind >= 0, walks.behind, beyond)
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
-    # On the edge itself rounding would decide whether a face that ends there shades it.
-    sides = jnp.stack([front, beyond])
-    x, y = (jnp.stack([along[3], along[1]]) for along in (x, y))
-    values, _ = edge_values(corners_of(sides, faces, pixels), x, y)
-    beside = barycentrics([jnp.maximum(value, 0) for value in values])
+    beside = sides_of(jnp.stack([front, beyond]), walks, surface)
+    bare = pictured < 0
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
 
@@ -393,22 +353,19 @@ def look(
         front,
         thickness,
         pictured,
-        inwards,
-        connected[0] & connected[1],
+        (rim_depth, inner),
+        walks.connected[0] & walks.connected[1],
         middle,
         end - begin,
         -out,
         centre,
-        faces,
-        pixels,
-        topology.neighbors,
-        volume,
+        surface,
     )
 
     # Which side is what the pixel shows at its centre: one surface may lie there in several layers.
     shows = pictured[4] >= 0
     is_front = shows & (front_shown == 4) & (patch[4] == front_patch)
-    is_front = is_front & (~fold | ((front_look == 4) & connected[0]))
+    is_front = is_front & (~fold | ((front_look == 4) & walks.connected[0]))
     alike = (beyond == -1) | (beyond == pictured[4])
     is_beyond = shows & (beyond_look == 4) & alike
 
@@ -451,27 +408,6 @@ def _at(image: Int[Array, "height width"], column: Array, row: Array) -> Int[Arr
     """The values of an image at pixels, or at the nearest ones that it has."""
     height, width = image.shape
     return stored(image[row.clip(0, height - 1), column.clip(0, width - 1)].astype(jnp.int32))
-
-
-def _last_unseen(
-    farthest: Array, pixel: Array, look: Array, front_patch: Array, patches: Array
-) -> Array:
-    """The farthest unseen face of a pixel or, if that is of the surface in front, of the next."""
-    here, there = _at(farthest, *pixel), _at(farthest, *(pixel + steps_to(look)))
-    other = (here >= 0) & (patches[jnp.maximum(here, 0)] != front_patch)
-    return jnp.where(other | (there < 0), here, there)
-
-
-def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
-    """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
-    x, y = steps_to(jnp.arange(9))[..., None] - point[:, None]
-    return _seen_least(mask, pictured, x * x + y * y)
-
-
-def _seen_least(mask: Array, pictured: Array, values: Array) -> Array:
-    """What the pixel of the 3×3 shows where a value is least, of a mask; or -1."""
-    best = least_row(mask, values)
-    return jnp.where(best < 9, picked(pictured, jnp.minimum(best, 8)), -1)
 
 
 def _thickness(

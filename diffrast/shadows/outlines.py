@@ -21,7 +21,7 @@ from diffrast._device import anywhere, in_strides, lanes, over_views
 from diffrast._selection import divided, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
-from diffrast.edges.neighborhood import first_row, picked, walk
+from diffrast.edges.neighborhood import Surface, first_row, picked, walk
 from diffrast.edges.pieces import facing, to_pixels
 from diffrast.edges.planes import Table, barycentrics, edge_functions, largest, lowest
 from diffrast.geometry import Geometry, Points, positions_at
@@ -204,10 +204,7 @@ def _are_joined(
         jnp.where(asked, face, -1).reshape(1, -1),
         x.reshape(1, -1),
         y.reshape(1, -1),
-        geometry.faces,
-        pixels,
-        topology.neighbors,
-        volume,
+        Surface(geometry.faces, pixels, topology, volume),
     )
     return asked & (end.reshape(asked.shape) == _next_to(face))
 
