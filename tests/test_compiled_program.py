@@ -187,7 +187,9 @@ def test_temporary_memory_is_not_mapped_anew_at_each_call():
     floor = dr.Object(dr.shapes.plane(6, 6), transform=dr.linalg.translation((0, 0, -1.0)))
     over_floor = dr.Scene(objects=[*shadowed.objects, floor], lights=shadowed.lights)
     for program, arguments in (
+        gradient(scene(), "camera", options),
         gradient(dr.Scene(objects=[fine], lights=[SUN]), "camera", options),
+        (jax.jit(dr.render), (shadowed, CAMERA, options)),
         gradient(over_floor, "lights", options),
     ):
         quickly = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
