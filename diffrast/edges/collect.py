@@ -203,9 +203,7 @@ class _Edges:
         size = {"height": self.height, "width": self.width}
         at_once = self.at_once.cut
         pieces = cut(segments, ends, n * at_once, at_once=at_once, **size)
-        return uncovered(
-            pieces, segments, self.surface.faces, self.surface.pixels, self.view.face_image
-        )
+        return uncovered(pieces, segments, self.surface, self.view.face_image)
 
 
 def _edges(
@@ -291,15 +289,7 @@ def _shadows(view: View, cast: Cast, method: Method, surface: Surface) -> Work:
             rows=jnp.stack([weight_of_light - cast.weight.size, weight_of_light]),
             pixel=jnp.stack(divided(place, width)[::-1]),
         )
-        outlines = cross_shadows(
-            places,
-            exists,
-            cast,
-            view.faces,
-            view.topology.neighbors,
-            surface.pixels,
-            view.face_image,
-        )
+        outlines = cross_shadows(places, exists, cast, surface, view.face_image)
 
         def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
             return with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))

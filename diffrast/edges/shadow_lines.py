@@ -27,11 +27,10 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
-from diffrast.edges.neighborhood import first_row, picked, pixels_round, steps_to
+from diffrast.edges.neighborhood import Surface, first_row, picked, pixels_round, steps_to
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
-    Table,
     barycentrics,
     cross_rows,
     edge_functions,
@@ -152,13 +151,12 @@ def cross_shadows(
     places: Places,
     exists: Bool[Array, " n"],
     cast: Cast,
-    faces: Int[Array, "F 3"],
-    neighbors: Int[Array, "F 3"],
-    pixels: Table,
+    surface: Surface,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Outlines:
     """Find the lines at these places: of each edge on each face on which its shadow may fall."""
     light, rows, pixel = places
+    faces, pixels, topology, _ = surface
     centre = pixel.astype(pixels.dtype) + 0.5
 
     def place(vertex: Array) -> Array:
@@ -183,7 +181,7 @@ def cross_shadows(
     looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
     first_is_lit = jnp.stack([picked(lit, k) for k in looks[0]])
     looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
-    joined = stored(neighbors[seen[4]].T)
+    joined = stored(topology.neighbors[seen[4]].T)
     joins = counts[4] & (joined >= 0) & cast.turned[light, jnp.maximum(joined, 0)]
     joins = joins & (cast.patches[jnp.maximum(joined, 0)] == patch[4])
     near = jnp.concatenate([shown[4:5], joined, shown[_NEAREST[1:]]])

@@ -97,8 +97,7 @@ class Seen(NamedTuple):
 def uncovered(
     pieces: Pieces,
     segments: Segments,
-    faces: Int[Array, "F 3"],
-    pixels: Table,
+    surface: Surface,
     face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Pieces:
     """Pieces without those that the face seen at their pixel's centre hides all along.
@@ -122,7 +121,7 @@ def uncovered(
     x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
     y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
     x, y = stored_together((x, y))
-    corners = corners_of(face, faces, pixels)[:, :, None, None]
+    corners = corners_of(face, surface.faces, surface.pixels)[:, :, None, None]
     values, depth = edge_values(corners, x, y, near=(x[0, 0], y[0, 0]))
     own_depth = weights[0] + pieces.range * (weights[1] - weights[0])
     before = covers(values) & (depth > own_depth * (1 + FINE_TOLERANCE))

@@ -91,7 +91,8 @@ def outwards(
         farthest: of faces there that no centre shows, or -1.
         surface: all faces.
     """
-    _, middle, out, near, fold, own, _, _, pictured, patch, foreign, depths, _, look = spot
+    near, fold, own, pictured = spot.near, spot.fold, spot.own, spot.pictured
+    foreign, depths, look = spot.foreign, spot.depths, spot.beyond_look
     found = fold & (nearest > 0)
     before = foreign & (depths > near * (1 + FINE_TOLERANCE))
     least = stored(jnp.where(found, nearest * (1 + FINE_TOLERANCE), -jnp.inf))
@@ -100,13 +101,13 @@ def outwards(
     crease = ~fold & ~jnp.any((pictured == own[0]) | (pictured == own[1]), axis=0)
     shown = picked(pictured, look)
     masks = jnp.stack([(fold | crease) & before, search & after])
-    points = jnp.stack([middle, middle + LOOK * out])
+    points = jnp.stack([spot.middle, spot.middle + LOOK * spot.out])
     hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
     last = _seen_least(crease & before, pictured, depths)
     shown_fits = picked(after, look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
     behind = stored(jnp.where(crease, last, behind))
-    others = search & after & (patch != surface.topology.patches[jnp.maximum(behind, 0)])
+    others = search & after & (spot.patch != surface.topology.patches[jnp.maximum(behind, 0)])
     second = _seen_least(others, pictured, depths)
     starts = search & (second < 0) & (farthest != own[0]) & (farthest != own[1])
     second = jnp.where(starts, farthest, second)
