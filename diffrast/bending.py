@@ -16,6 +16,7 @@ PARTS_AT_ONCE = 1024  # parts of pixels that are shaded side by side on a CPU,
 _FEW = 128  # or in small images
 _SHARE = 10  # of so many pixels at most one is shaded at more points
 _BEND = 0.08  # of the picture's mean colour: by how much more it changes to one side of a pixel
+_SHARP = 8  # times as much: there the change at a point tells nothing of that of the pixel
 _PLAIN = 0.005  # of the same: what edges may add where they part nothing
 _ROWS = 8  # one of so many tells the mean
 _BLOCK = 16  # pixels, one below the other
@@ -28,7 +29,17 @@ class Turning(NamedTuple):
     face_image: Int[Array, "height_with_border width_with_border"]  # what is seen, -1 for nothing
     hard: Float[Array, "height_with_border width_with_border 3"]  # its colours
     mean: Float[Array, ""]  # of the whole
-    chosen: Bool[Array, "height width"]  # pixels that get their surface's mean colour in any case
+    much: Int[Array, "height width"]  # 0 to 2: how much they bend there
+
+    @property
+    def chosen(self) -> Bool[Array, "height width"]:
+        """The pixels that get their surface's mean colour in any case."""
+        return self.much > 0
+
+    @property
+    def sharp(self) -> Bool[Array, "height width"]:
+        """Those of them where colours bend most."""
+        return self.much > 1
 
 
 class Chosen(NamedTuple):
@@ -74,8 +85,9 @@ def find_turning(
         def are_many(least: Array) -> Array:
             return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
 
-        many = bends > lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
-        return mean, stored(many.astype(jnp.int8)) > 0  # else the numbers would be held
+        least = lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
+        much = jnp.where(bends > jnp.maximum(least, _SHARP * _least(mean)), 2, bends > least)
+        return mean, stored(much.astype(jnp.int8))  # else the numbers would be held
 
     seen = lax.stop_gradient((face_image, hard))
     return Turning(*seen, *over_views(find, face_image.size)(*seen))
@@ -83,12 +95,12 @@ def find_turning(
 
 def bending(turning: Turning, image: Float[Array, "height width 3"]) -> Chosen:
     """The pixels where colours bend most, and how edges part them, of an image with edges."""
-    face_image, hard, mean, chosen = turning
+    face_image, hard, mean, _ = turning
     changes = stored(_sums(jnp.abs(image - hard[1:-1, 1:-1])))
     parted = stored(changes > _PLAIN * mean)
     # What the background shows, or an edge changes, is not a number.
     color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
-    bends = stored(jnp.where(chosen, jnp.inf, _bends(color)))
+    bends = stored(jnp.where(turning.chosen, jnp.inf, _bends(color)))
     return _largest(bends, _least(mean), parted)
 
 

@@ -39,7 +39,7 @@ from diffrast.shadows import Parted, Reached, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 from diffrast.texture import CubeTexture
 from diffrast.texturing import paint_scene, seams, skybox
-from diffrast.turning import with_turns
+from diffrast.turning import turns
 
 
 class Buffers(NamedTuple):
@@ -154,20 +154,19 @@ def render(
             view = _edged_view(
                 hard, world, topology, apart, clip, pixels, reached, background, turning, settings
             )
+            finish = None
+            if turning is not None:
+                unshadowed = world._replace(shadows=None)
+                volume = view.volume
+                assert volume is not None
+                finish = turns(shader, unshadowed, drawn, reached, topology, apart, volume, turning)
             image = antialias_image(
                 view,
                 shader=partial(_shade_points, shading=settings.shading),
                 glow=partial(_glow_at, shading=settings.shading),
                 cull_backfaces=settings.cull_backfaces,
+                finish=finish,
             )
-        if turning is not None:
-            with jax.named_scope("turning"):
-                unshadowed = world._replace(shadows=None)
-                volume = view.volume
-                assert volume is not None
-                image = with_turns(
-                    shader, unshadowed, drawn, reached, topology, apart, volume, turning, image
-                )
         if side == 1:
             return image
         color = [image[..., c] for c in range(3)]

@@ -8,6 +8,7 @@ hides the surface there.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -15,71 +16,56 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from diffrast._device import anywhere, at_once, most, over_views
+from diffrast._device import over_views
 from diffrast._linear import linear_map, linear_zeros
-from diffrast._selection import batches_of, compacted, divided, over_batches
+from diffrast._selection import divided
 from diffrast._stored import stored, stored_together
-from diffrast._topology import Topology, third_corner
+from diffrast._topology import Topology
 from diffrast._varying import varying_alike, varying_zero
 from diffrast.bending import Chosen, Turning, bending
-from diffrast.edges.neighborhood import Surface, walk
-from diffrast.edges.pieces import to_pixels
-from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
+from diffrast.edges.antialias import Finish
+from diffrast.edges.neighborhood import pixels_round
 from diffrast.geometry import Points, points_at
 from diffrast.light import Columns
 from diffrast.raster.evaluate import Drawn, pixels_at
 from diffrast.shadows import Reached
+from diffrast.within import (
+    POINTS,
+    Parts,
+    PointsWithin,
+    faces_at,
+    faces_of,
+    number_seen,
+    over_parts,
+    parts_of,
+)
 
 Shade: TypeAlias = Callable[[Any, Points, Reached], Columns]
 
-_POINTS_AT_ONCE = 512  # that may be hidden
+_BESIDE = 0.02  # pixels: to where slopes are taken
+_STEEP = 2  # times the range of the colours round a pixel: more does not pass in it
 
 
-def _points() -> np.ndarray:
-    """Where pixels are shaded, to the right of their centres and below, of shape (2, 5 points, 5).
+class _Fixed(NamedTuple):
+    """By what pixels are chosen, and what is seen at their points is found."""
 
-    The centre, and four points, no two in a row or a column, of a whole pixel; then of each quarter
-    of one, of all the points of a grid.
-    """
-    whole = np.array([[-1, 3, 1, -3], [-3, -1, 3, 1]])[:, :, None]
-    corners = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]])
-    quarters = corners[:, :, None] + 2 * corners[:, None]
-    points = np.pad(np.concatenate([whole, quarters], axis=2), ((0, 0), (1, 0), (0, 0)))
-    return (points / 8).astype(np.float32)
+    turning: Turning
+    reached: Reached  # images with a border of one pixel
+    topology: Topology
+    apart: Bool[Array, " edges"]
+    volume: Float[Array, " faces"]
 
 
-_POINTS = _points()
-_STEEP = abs(_POINTS[1]) >= abs(_POINTS[0])
-_ASIDE = np.where([~_STEEP, _STEEP], np.sign(_POINTS), 0).astype(np.int32)  # the next pixel
+class _Given(NamedTuple):
+    """That, and what the colours of points depend on."""
+
+    fixed: _Fixed
+    colored: tuple[Any, Drawn]
 
 
-class _Points(NamedTuple):
-    """What is seen there."""
-
-    chosen: Chosen
-    face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
-    reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
-
-
-class _Parts(NamedTuple):
-    """A batch of pixels and quarters of them."""
-
-    place: Int[Array, " some"]
-    exists: Bool[Array, " some"]
-    points: Int[Array, " some"]  # which of `_POINTS`
-
-
-class _Inputs(NamedTuple):
-    """What the colours of points depend on."""
-
-    data: Any
-    drawn: Drawn
-    points: _Points
-
-
-def with_turns(
+def turns(
     shade: Shade,
     data: Any,
     drawn: Drawn,
@@ -88,12 +74,11 @@ def with_turns(
     apart: Bool[Array, " edges"],
     volume: Float[Array, " faces"],
     turning: Turning,
-    image: Float[Array, "height width 3"],
-) -> Float[Array, "height width 3"]:
-    """An image with the mean colours of pixels in which colours turn.
+) -> Finish:
+    """What gives an image with edges the mean colours of pixels in which colours turn.
 
-    Differentiable as the image itself and as the colours are, but for second derivatives of what is
-    added; that has none where edges part pixels, which have their derivative already.
+    It is the change of these means that edges weigh, in place of that of the colours at centres: of
+    a highlight narrower than a pixel this may be any number. No second derivatives.
 
     Args:
         shade: colours of points, one array a channel; its first argument is `data`.
@@ -104,248 +89,210 @@ def with_turns(
         apart: whether colours may jump across an edge.
         volume: of faces, what `facing` found.
         turning: what `find_turning` found; the edges know of the pixels chosen there.
-        image: with edges and without the border.
     """
-    height, width = image.shape[:2]
 
-    def find(
-        turning: Turning,
-        image: Array,
-        reached: Reached,
-        clip: Array,
-        faces: Array,
-        topology: Topology,
-        apart: Array,
-        volume: Array,
-    ) -> _Points:
+    def draw(given: _Given, image: Array) -> tuple[Array, PointsWithin]:
+        height, width, _ = image.shape
+        with jax.named_scope("turning"):
+            points = _find(given, image)
+            added = _added(shade, (height, width), given.colored, points)
+            return _put(image, points.chosen, added), points
+
+    def change(given: _Given, points: PointsWithin, changes: _Given, colors: Array) -> Array:
+        size = colors.shape[0] - 2, colors.shape[1] - 2
+        with jax.named_scope("turning"):
+            if all(isinstance(part, SymbolicZero) for part in jax.tree.leaves(changes.colored)):
+                return colors
+            turning = given.fixed.turning
+            added = _change(shade, size, given.colored, points, turning.hard, changes.colored)
+            return _put(colors, points.chosen, added, border=1)
+
+    topology = jax.tree.map(jnp.asarray, topology)
+    fixed = lax.stop_gradient(_Fixed(turning, reached, topology, apart, volume))
+    return Finish(_Given(fixed, (data, drawn)), draw, change)
+
+
+def _put(image: Array, chosen: Chosen, added: Array, *, border: int = 0) -> Array:
+    """Add to the chosen pixels, in an image with such a border."""
+    place = jnp.arange(chosen.number.size)
+    row, column = divided(chosen.number, image.shape[1] - 2 * border)
+    row = jnp.where(place < chosen.total, row + border, image.shape[0] + place)  # none twice
+    return image.at[row, column + border].add(added, mode="drop", unique_indices=True)
+
+
+def _find(given: _Given, image: Float[Array, "height width 3"]) -> PointsWithin:
+    """The pixels in which colours turn, and what is seen at their points."""
+    width = image.shape[1]
+    drawn = given.colored[1]
+
+    def find(fixed: _Fixed, image: Array, clip: Array, faces: Array) -> PointsWithin:
+        turning, reached, topology, apart, volume = fixed
         chosen = bending(turning, image)
         row, column = divided(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
-        face = _faces_at(chosen, turning.face_image, clip, faces, topology, apart, volume)
-        return _Points(chosen, face, lit)
-
-    seen = lax.stop_gradient((image, reached, drawn.positions_clip))
-    surface = drawn.faces, jax.tree.map(jnp.asarray, topology), apart, lax.stop_gradient(volume)
-    points = over_views(find, height * width)(turning, *seen, *surface)
-    added = _added(shade, (height, width), _Inputs(data, drawn, points))
-    number, _, total = points.chosen
-    place = jnp.arange(number.size)
-    row, column = divided(number, width)
-    row = jnp.where(place < total, row, height + place)  # none twice
-    return image.at[row, column].add(added, mode="drop", unique_indices=True)
-
-
-def _parts(chosen: Chosen, n: Array, count: Array) -> _Parts:
-    """The batch `n` of so many parts."""
-    size = chosen.at_once
-    number = n * size + jnp.arange(size, dtype=jnp.int32)
-    after = number - chosen.plain
-    whole = (after < 0) | (chosen.parts_of_each == 1)
-    place = jnp.where(whole, number, chosen.plain + after // 4)
-    place = jnp.minimum(place, chosen.number.size - 1)
-    return _Parts(*stored_together((place, number < count, jnp.where(whole, 0, 1 + after % 4))))
-
-
-def _over_parts(chosen: Chosen, count: Array, step: Callable[[Array, Any], Any], start: Any) -> Any:
-    return lax.fori_loop(0, batches_of(most(count), chosen.at_once), step, start)
-
-
-def _faces_at(
-    chosen: Chosen,
-    face_image: Array,
-    clip: Array,
-    faces: Array,
-    topology: Topology,
-    apart: Array,
-    volume: Array,
-) -> Int[Array, "points parts"]:
-    """The faces at the points of pixels, found from those at their centres.
-
-    What the next pixels show may hide them.
-    """
-    height, width = face_image.shape
-    count = chosen.parts
-
-    def find(found: Array) -> Array:
-        pixels = stored(to_pixels(clip, height, width))
-        neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
-        surface = Surface(faces, pixels, topology._replace(neighbors=neighbors), volume)
-
-        def add(n: Array, found: Array) -> Array:
-            place, exists, part = _parts(chosen, n, count)
-            row, column = stored(divided(chosen.number[place], width - 2))
-            x0, y0 = (at.astype(clip.dtype) + 1.5 for at in (column, row))
-            centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
-            right, down = stored(jnp.asarray(_POINTS, clip.dtype)[:, :, part])
-            point = x, y = stored_together((x0 + right, y0 + down))
-            covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
-            covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
-            own = jnp.broadcast_to(centre, x.shape)
-            # Beyond a fold, to which a way might lead round its end, edges tell what is seen.
-            start = stored(jnp.where(covered, -1, own))
-            ends, there = walk(start, x, y, surface, straight=True)
-            seen = stored(jnp.where(covered, own, jnp.where(there, ends, -1)))
-            right, down = stored(jnp.asarray(_ASIDE)[:, :, part])
-            beside = stored(face_image[row + 1 + down, column + 1 + right])
-            parted = exists & (place >= chosen.plain)
-            beside = stored(jnp.where(parted & (beside != own), beside, -1))
-            seen = _unhidden(seen, beside, point, (x0 + right, y0 + down), surface)
-            return lax.dynamic_update_slice_in_dim(found, seen, n * place.size, 1)
-
-        return _over_parts(chosen, count, add, found)
-
-    nowhere = jnp.full((_POINTS.shape[1], chosen.number.size), -1, jnp.int32)
-    nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart, volume))
-    return lax.cond(anywhere(count > 0), find, lambda nowhere: nowhere, nowhere)
-
-
-def _unhidden(
-    seen: Int[Array, "points parts"],
-    beside: Int[Array, "points parts"],
-    point: tuple[Array, Array],
-    centre: tuple[Array, Array],
-    surface: Surface,
-) -> Int[Array, "points parts"]:
-    """What is seen at points, -1 where the surface that the next pixel shows lies before that.
-
-    It does not if at that pixel's centre it lies behind the plane of what is seen at the point.
-    """
-    faces, pixels, _, _ = surface
-    order, count = compacted(
-        ((seen >= 0) & (beside >= 0) & (beside != seen)).reshape(-1),
-        jnp.arange(seen.size, dtype=jnp.int32),
-    )
-    known = stored_together([part.reshape(-1) for part in (beside, *point, *centre)])
-
-    def hide(number: Array, exists: Array, seen: Array) -> Array:
-        face, other, x, y, centre_x, centre_y = stored_together(
-            [part[number] for part in (seen, *known)]
+        face = faces_at(chosen, turning.face_image, clip, faces, topology, apart, volume)
+        wanted = (jnp.arange(chosen.number.size) < chosen.plain) | stored(
+            turning.sharp.reshape(-1)[chosen.number]
         )
-        corners = corners_of(face, faces, pixels)
+        seen = jnp.where(wanted, number_seen(chosen, face), 0)
+        return PointsWithin(chosen, stored(seen.astype(jnp.int8)), face, lit)
 
-        def is_before(other: Array, x: Array, y: Array, tolerance: float = 0) -> Array:
-            both = corners_of(other, faces, pixels), corners
-            near, far = (edge_values(of_one, x, y)[1] for of_one in both)
-            return near > far * (1 + tolerance)
-
-        may_hide = exists & is_before(other, centre_x, centre_y)
-        start = stored(jnp.where(may_hide, other, -1))
-        end, there = walk(start, x, y, surface)
-        hidden = there & (end >= 0) & is_before(end, x, y, FINE_TOLERANCE)
-        return seen.at[jnp.where(hidden, number, seen.size)].set(-1, mode="drop")
-
-    some = at_once(_POINTS_AT_ONCE, seen.size)
-    return over_batches(order, count, some, hide, seen.reshape(-1)).reshape(seen.shape)
+    seen = lax.stop_gradient((given.fixed, image, drawn.positions_clip, drawn.faces))
+    return over_views(find, image.shape[0] * width)(*seen)
 
 
-def _together(topology: Topology, apart: Array) -> Array:
-    return topology.neighbors + varying_zero((topology, apart))
-
-
-def _parted(topology: Topology, apart: Array) -> Array:
-    """The neighbours of faces, but none across these edges."""
-    side, count = third_corner(topology.edges.corners), topology.neighbors.shape[0]
-    face = jnp.where(apart[:, None], topology.edges.faces, -1)
-    face = jnp.where(face >= 0, face, count)
-    return _together(topology, apart).at[face, side].set(-1, mode="drop")
-
-
-def _added(shade: Shade, size: tuple[int, int], inputs: _Inputs) -> Float[Array, "places 3"]:
+def _added(
+    shade: Shade, size: tuple[int, int], colored: tuple[Any, Drawn], points: PointsWithin
+) -> Float[Array, "places 3"]:
     """By how much the mean colours of pixels differ from those at their centres."""
+
+    def all_batches(colored: tuple[Any, Drawn], points: PointsWithin) -> Array:
+        count = points.chosen.parts
+
+        def step(n: Array, total: Array) -> Array:
+            parts = parts_of(points.chosen, n, count)
+            colors = _colors(shade, size, colored, points, parts, n)
+            return total.at[parts.place].add(stored(_means(colors, points, parts, n)))
+
+        start = _nothing(colored, points) + varying_zero((colored, points))
+        return over_parts(points.chosen, count, step, start)
+
+    return over_views(all_batches, size[0] * size[1])(*varying_alike((colored, points)))
+
+
+def _change(
+    shade: Shade,
+    size: tuple[int, int],
+    colored: tuple[Any, Drawn],
+    points: PointsWithin,
+    hard: Float[Array, "height_with_border width_with_border 3"],
+    changes: tuple[Any, Drawn],
+) -> Float[Array, "places 3"]:
+    """By how much more the mean colours of pixels change than those at their centres.
+
+    The means are of what is seen of the surface, and bounded by `_share_of_change`.
+    """
+    fixed = colored, points, hard = varying_alike(lax.stop_gradient((colored, points, hard)))
+    leaves, tree = jax.tree.flatten(colored)
+    known = enumerate(jax.tree.leaves(changes))
+    moving = {i: change for i, change in known if not isinstance(change, SymbolicZero)}
+
+    def of_batch(fixed: Any, n: Array) -> tuple[Array, Callable[..., Array], list[Array]]:
+        """Places, and their means as a function of what moves, which is given as well."""
+        colored, points, hard = fixed
+        leaves = jax.tree.leaves(colored)
+        parts = parts_of(points.chosen, n, points.chosen.parts)
+        row, column = divided(points.chosen.number[parts.place], size[1])
+        around = stored(pixels_round(hard, column, row))
+        at_points = partial(_colors, shade, size, colored, points, parts, n)
+        share = _share_of_change(at_points, around)
+        seen = points.seen[parts.place].astype(share.dtype)
+        all_points = jnp.where(parts.points > 0, 16, 4)
+        over_seen = jnp.where(seen > 0, all_points / jnp.maximum(seen, 1), 0).astype(share.dtype)
+        over_seen = stored(over_seen)
+
+        def means(values: list[Array]) -> Array:
+            given = dict(zip(moving, values, strict=True))
+            moved = jax.tree.unflatten(tree, [given.get(i, leaf) for i, leaf in enumerate(leaves)])
+            colors = _colors(shade, size, moved, points, parts, n)
+            return over_seen[:, None] * _means(colors, points, parts, n, share)
+
+        return parts.place, means, [leaves[i] for i in moving]
+
+    def over_batches_of(fixed: Any, step: Callable[[Array, Any], Any], start: Any) -> Any:
+        chosen = fixed[1].chosen
+        return over_parts(chosen, chosen.parts, step, start)
+
+    def push(fixed: Any, changes: list[Array], nothing: Array) -> Array:
+        def step(n: Array, total: Array) -> Array:
+            place, means, at = of_batch(fixed, n)
+            return total.at[place].add(jax.jvp(means, (at,), (changes,))[1])
+
+        return over_batches_of(fixed, step, nothing)
+
+    def pull(fixed: Any, cotangent: Array) -> list[Array]:
+        def step(n: Array, total: list[Array]) -> list[Array]:
+            place, means, at = of_batch(fixed, n)
+            (back,) = jax.vjp(means, at)[1](cotangent[place])
+            return jax.tree.map(jnp.add, total, back)
+
+        start = [linear_zeros(leaves[i].shape, cotangent) for i in moving]
+        return over_batches_of(fixed, step, start)
 
     def over(function: Callable[..., Any]) -> Callable[..., Any]:
         return over_views(function, size[0] * size[1])
 
-    @jax.custom_jvp
-    def added(inputs: _Inputs) -> Array:
-        def all_batches(inputs: _Inputs) -> Array:
-            chosen = inputs.points.chosen
-            count = chosen.parts
-
-            def step(n: Array, total: Array) -> Array:
-                parts = _parts(chosen, n, count)
-                rows = stored(_of_parts(shade, size, inputs, parts, n))
-                return total.at[parts.place].add(rows)
-
-            return _over_parts(chosen, count, step, _nothing(inputs) + varying_zero(inputs))
-
-        return over(all_batches)(varying_alike(inputs))
-
-    def derivative(primals: Any, tangents: Any) -> tuple[Array, Array]:
-        leaves, tree = jax.tree.flatten(varying_alike(lax.stop_gradient(primals[0])))
-        changes = jax.tree.leaves(tangents[0])
-        used = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
-
-        def of_used(leaves: list[Array], n: Array) -> tuple[Array, Callable[..., Array]]:
-            chosen = jax.tree.unflatten(tree, leaves).points.chosen
-            parts = _parts(chosen, n, chosen.plain)
-
-            def of(*values: Array) -> Array:
-                given = dict(zip(used, values, strict=True))
-                both = [given.get(i, leaf) for i, leaf in enumerate(leaves)]
-                return _of_parts(shade, size, jax.tree.unflatten(tree, both), parts, n)
-
-            return parts.place, of
-
-        def over_plain(leaves: list[Array], step: Callable[[Array, Any], Any], start: Any) -> Any:
-            chosen = jax.tree.unflatten(tree, leaves).points.chosen
-            return _over_parts(chosen, chosen.plain, step, start)
-
-        def push(leaves: list[Array], changes: list[Array], nothing: Array) -> Array:
-            at = [leaves[i] for i in used]
-
-            def step(n: Array, total: Array) -> Array:
-                place, of = of_used(leaves, n)
-                return total.at[place].add(jax.jvp(of, at, changes)[1])
-
-            return over_plain(leaves, step, nothing)
-
-        def pull(leaves: list[Array], cotangent: Array) -> list[Array]:
-            at = [leaves[i] for i in used]
-
-            def step(n: Array, total: list[Array]) -> list[Array]:
-                place, of = of_used(leaves, n)
-                back = jax.vjp(of, *at)[1]
-                return jax.tree.map(jnp.add, total, list(back(cotangent[place])))
-
-            return over_plain(leaves, step, [linear_zeros(leaf.shape, cotangent) for leaf in at])
-
-        change = linear_map(
-            lambda changes, nothing: over(push)(leaves, changes, nothing),
-            lambda cotangent: over(pull)(leaves, cotangent),
-            [changes[i] for i in used],
-            _nothing(primals[0]),
-        )
-        return added(*primals), change
-
-    added.defjvp(derivative, symbolic_zeros=True)
-    return added(inputs)
+    return linear_map(
+        lambda changes, nothing: over(push)(fixed, changes, nothing),
+        lambda cotangent: over(pull)(fixed, cotangent),
+        list(moving.values()),
+        _nothing(colored, points),
+    )
 
 
-def _nothing(inputs: _Inputs) -> Array:
-    return jnp.zeros((inputs.points.chosen.number.size, 3), inputs.drawn.positions_clip.dtype)
+def _nothing(colored: tuple[Any, Drawn], points: PointsWithin) -> Array:
+    return jnp.zeros((points.chosen.number.size, 3), colored[1].positions_clip.dtype)
 
 
-def _of_parts(
-    shade: Shade, size: tuple[int, int], inputs: _Inputs, parts: _Parts, n: Array
-) -> Float[Array, "some 3"]:
-    """What `_added` finds for parts of the batch `n`: of what is not seen, edges tell."""
-    data, drawn, points = inputs
+def _colors(
+    shade: Shade,
+    size: tuple[int, int],
+    colored: tuple[Any, Drawn],
+    points: PointsWithin,
+    parts: Parts,
+    n: Array,
+    shift: Float[Array, "2"] | None = None,
+) -> list[Float[Array, "points some"]]:
+    """The colours at the points of parts of the batch `n`, all shifted to the right and down."""
+    data, drawn = colored
     row, column = divided(points.chosen.number[parts.place], size[1])
-    some = row.size
-    face = lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
+    face = faces_of(points, parts, n)
     full = size[0] + 2, size[1] + 2
     pixels = pixels_at(face, row + 1, column + 1, full, drawn.positions_clip.dtype)
-    right, down = jnp.asarray(_POINTS)[:, :, parts.points]
+    right, down = jnp.asarray(POINTS)[:, :, parts.points]
+    if shift is not None:
+        right, down = right + shift[0], down + shift[1]
     x, y = pixels.x + 2 * right, pixels.y - 2 * down
     flat, x, y = stored_together([part.reshape(-1) for part in (face, x, y)])
     # Stored, and the colours: in what repeats rows no loop is vectorised.
     lit = jax.tree.map(lambda part: jnp.tile(part[parts.place], face.shape[0]), points.reached)
     lit = stored(lit)
     seen = points_at(drawn, pixels._replace(face=flat, x=x, y=y))
-    colors = [color.reshape(face.shape) for color in stored(shade(data, seen, lit))]
-    used = (face[1:] >= 0) & parts.exists
-    quarter = jnp.array(0.25, x.dtype)
-    share = jnp.where(parts.points > 0, quarter, 1)  # of the pixel
-    means = [jnp.mean(jnp.where(used, color[1:] - color[0], 0), axis=0) for color in colors]
-    return jnp.stack([share * mean for mean in means], axis=-1)
+    return [color.reshape(face.shape) for color in stored(shade(data, seen, lit))]
+
+
+def _means(
+    colors: list[Float[Array, "points some"]],
+    points: PointsWithin,
+    parts: Parts,
+    n: Array,
+    share: Float[Array, "points_but_one some"] | None = None,
+) -> Float[Array, "some 3"]:
+    """The means of colours less those at the centres; of what is not seen, edges tell.
+
+    With a share of each point's colour, these are for derivatives alone.
+    """
+    used = (faces_of(points, parts, n)[1:] >= 0) & parts.exists
+    quarter = jnp.array(0.25, colors[0].dtype)
+    part = jnp.where(parts.points > 0, quarter, 1)  # of the pixel
+    others = [color[1:] if share is None else share * color[1:] for color in colors]
+    more = [other - color[0] for other, color in zip(others, colors, strict=True)]
+    return jnp.stack([part * jnp.mean(jnp.where(used, m, 0), axis=0) for m in more], axis=-1)
+
+
+def _share_of_change(
+    colors_at: Callable[..., list[Array]], around: Float[Array, "9 some 3"]
+) -> Float[Array, "points_but_one some"]:
+    """How much of their change counts at points: less where it is over within less than a pixel.
+
+    The change of a pixel's mean is no more than what its colours differ by while they pass, but
+    that at a point is as large as a slope is steep: it is cut to what the colours round the pixel
+    allow.
+    """
+    shifts = jnp.asarray(np.array([[0, 0], [_BESIDE, 0], [0, _BESIDE]], np.float32))
+    colors = jax.vmap(lambda shift: jnp.stack(colors_at(shift=shift)))(shifts)
+    right, down = jnp.sum(jnp.abs(colors[1:] - colors[0]), axis=1) / _BESIDE
+    steepness = jnp.sqrt(right * right + down * down)[1:]
+    most = _STEEP * jnp.sum(jnp.max(around, axis=0) - jnp.min(around, axis=0), axis=-1)
+    steep = steepness > most
+    return stored(jnp.where(steep, most / jnp.where(steep, steepness, 1), 1))

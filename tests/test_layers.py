@@ -106,6 +106,7 @@ ORDER = [
     "diffrast.surface",
     "diffrast.deferred",
     "diffrast.bending",
+    "diffrast.within",
     "diffrast.turning",
     "diffrast.render",
     "diffrast.recolor",

@@ -1,7 +1,7 @@
 """The stage that gives an image its edges; see `blend` for the method."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,23 @@ from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
 
 CREASES = ("none", "seams", "all")
+
+
+class Finish(NamedTuple):
+    """What is done with a picture that has its edges; see `diffrast.turning`.
+
+    Attributes:
+        data: a tree of arrays that it takes.
+        draw: `draw(data, picture)`, the finished picture and what its derivative is made of.
+        change: `change(data, made_of, changes, colors)`, linear in the changes of the data and of
+            the colours that the image without edges has at its pixels' centres: the change of what
+            these pixels show.
+    """
+
+    data: Any
+    draw: Callable[[Any, Array], tuple[Array, Any]]
+    change: Callable[[Any, Any, Any, Array], Array]
+
 
 PointShader = Callable[[Any, Int[Array, " n"], Float[Array, "n 3"]], Float[Array, "n channels"]]
 
@@ -159,7 +176,12 @@ def with_depth(view: View) -> View:
 
 
 def antialias_image(
-    view: View, *, shader: Shader | None, glow: Glow | None = None, cull_backfaces: bool
+    view: View,
+    *,
+    shader: Shader | None,
+    glow: Glow | None = None,
+    cull_backfaces: bool,
+    finish: Finish | None = None,
 ) -> Float[Array, "height width channels"]:
     """Give an image its edges, in value and in derivative, and cut off its border of one pixel.
 
@@ -168,6 +190,7 @@ def antialias_image(
         shader: see `Method`.
         glow: likewise; needed if the view has shadows.
         cull_backfaces: whether only front faces are drawn.
+        finish: what is done with it next, before anything is differentiated.
     """
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
@@ -182,30 +205,39 @@ def antialias_image(
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)
         return found
 
+    def finished(picture: Array, data: Any) -> tuple[Array, Any]:
+        return (picture, None) if finish is None else finish.draw(data, picture)
+
     @jax.custom_jvp
-    def blended(image: Array, positions_clip: Array, rest: View) -> Array:
+    def blended(image: Array, positions_clip: Array, rest: View, data: Any) -> Array:
         now = rest._replace(image=image, positions_clip=positions_clip)
         _, sums = gather(now, method._replace(capacity=0))
         assert sums is not None
-        return with_sums(image, sums)
+        return finished(with_sums(image, sums), data)[0]
 
     @jax.custom_jvp
-    def recorded(image: Array, positions_clip: Array, rest: View) -> tuple[Array, Any]:
+    def recorded(
+        image: Array, positions_clip: Array, rest: View, data: Any
+    ) -> tuple[Array, tuple[Any, ...]]:
         """The same, and what its derivative is made of."""
         now = rest._replace(image=image, positions_clip=positions_clip)
         records, sums = gather(now, method)
         assert sums is not None
-        return with_sums(image, sums, in_place=True), (records, sums.rims)
+        picture, made_of = finished(with_sums(image, sums, in_place=True), data)
+        return picture, (records, sums.rims, made_of)
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
-        image, positions_clip, rest = primals
-        d_image, d_clip = without_known_zeros(tangents[:2])
+        image, positions_clip, rest, data = primals
+        d_image, d_clip, _ = without_known_zeros((*tangents[:2], tangents[3]))
         # With a derivative of its own: a second one takes the first one of the picture, too.
-        out, made_of = recorded(image, positions_clip, rest)
+        out, made_of = recorded(*primals)
         now = rest._replace(image=image, positions_clip=positions_clip)
-        now, (records, rims) = lax.stop_gradient((now, made_of))
+        now, (records, rims, found) = lax.stop_gradient((now, made_of))
+        d_means = d_image
+        if finish is not None:
+            d_means = finish.change(lax.stop_gradient(data), found, tangents[3], d_image)
         points = to_pixels(d_clip, height, width).T
-        colors = d_image.reshape(-1, channels)
+        colors = d_image.reshape(-1, channels), d_means.reshape(-1, channels)
         d_out = apply_linear(now, method, records, rims, points, colors)
         return (out, made_of), d_out.reshape(height, width, channels)
 
@@ -219,4 +251,5 @@ def antialias_image(
 
     blended.defjvp(of_picture, symbolic_zeros=True)
     recorded.defjvp(of_recorded, symbolic_zeros=True)
-    return blended(view.image, view.positions_clip, lax.stop_gradient(view))
+    data = None if finish is None else finish.data
+    return blended(view.image, view.positions_clip, lax.stop_gradient(view), data)

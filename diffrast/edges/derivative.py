@@ -87,14 +87,15 @@ def _push(
     records: Records,
     rims: Array,
     points: Array,
-    colors: Array,
+    colors: tuple[Array, Array],
     added: Array,
 ) -> Array:
     """Change of the image with the homogeneous pixel coordinates and with the hard image.
 
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
-    at the next pixel inwards stands for it.
+    at the next pixel's stands for it, less what `_along` takes off.
     """
+    centres, means = colors
     rim = rims > 0
     inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
 
@@ -103,26 +104,26 @@ def _push(
         integers, _, weights, _ = rows
         _, front, _, inner, _, _ = integers.T
         share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return averages.at[front].add(share[:, None] * colors[inner]), added
+        return averages.at[front].add(share[:, None] * centres[inner]), added
 
     def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
         averages, added = total
         integers, jump, weights, motion = rows
         pixel, front, beyond, _, start, end = integers.T
-        here, there = (jnp.where(rim[i, None], averages[i], colors[i]) for i in (front, beyond))
+        here, there = (jnp.where(rim[i, None], averages[i], means[i]) for i in (front, beyond))
         moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
         value = moved[:, None] * jump + weights[:, :1] * (there - here)
         return averages, added.at[pixel].add(jnp.where(used[:, None], value, 0))
 
     adds = [add] if method.shader is None else [average, add]
-    start = jnp.zeros_like(colors), added
+    start = jnp.zeros_like(centres), added
     averages, added = _over_pieces(view, method, records, adds, start)
-    return added + cropped(jnp.where(rim[:, None], averages, colors), view.image.shape)
+    return added + cropped(jnp.where(rim[:, None], averages, means), view.image.shape)
 
 
 def _pull(
     view: View, method: Method, records: Records, rims: Array, cotangent: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, tuple[Array, Array]]:
     """The transpose of `_push`: what a change of the image means for `points` and `colors`."""
     rim = rims > 0
     inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
@@ -152,13 +153,21 @@ def _pull(
     points = linear_zeros((view.positions_clip.shape[0], 3), cotangent)
     start = points, own, linear_zeros(own.shape, cotangent)
     points, own, inwards = _over_pieces(view, method, records, adds, start)
-    return points, inwards + jnp.where(rim[:, None], 0, own)
+    return points, (inwards, jnp.where(rim[:, None], 0, own))
 
 
 def apply_linear(
-    view: View, method: Method, records: Records, rims: Array, points: Array, colors: Array
+    view: View,
+    method: Method,
+    records: Records,
+    rims: Array,
+    points: Array,
+    colors: tuple[Array, Array],
 ) -> Array:
-    """`_push`, of which JAX knows both directions."""
+    """`_push`, of which JAX knows both directions.
+
+    The change of colours is given twice, at the centres of pixels and of their means.
+    """
 
     def each_view(way: Callable[..., Any]) -> Callable[..., Any]:
         return over_views(lambda view, *rest: way(view, method, *rest), rims.size)
@@ -168,5 +177,5 @@ def apply_linear(
         lambda changes, nothing: push(view, records, rims, *changes, nothing),
         lambda cotangent: pull(view, records, rims, cotangent),
         (points, colors),
-        jnp.zeros_like(cropped(colors, view.image.shape)),
+        jnp.zeros_like(cropped(colors[0], view.image.shape)),
     )
