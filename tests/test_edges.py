@@ -397,7 +397,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
         records, sums = collect(found, method)
 
         def change(points, colors):
-            return apply_linear(found, method, records, sums.rims, points, colors)
+            return apply_linear(found, method, records, sums.rims, points, (colors, colors))
 
         points = jnp.ones((len(clip), 3)) * 0.1
         colors = jnp.ones((face.size, 3)) * jnp.arange(3.0)

@@ -137,7 +137,8 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         ((shade, size, (data, drawn), points),) = found
         chosen = points.chosen
         assert 32 < chosen.plain < chosen.total <= chosen.number.size
-        plain = points._replace(chosen=chosen._replace(total=chosen.plain))
+        all_seen = jnp.full(chosen.number.size, 4, jnp.int8)
+        plain = points._replace(chosen=chosen._replace(total=chosen.plain), seen=all_seen)
         hard = jnp.zeros((42, 42, 3)).at[::2].set(1e9)  # so that no slope is too steep
 
         def colored(vertices, direction):
