@@ -1,5 +1,6 @@
 """Pixels within which colours turn, found by how colours bend from each to the next ones."""
 
+from functools import reduce
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from diffrast._device import at_once, over_views
 from diffrast._selection import compacted, divided, over_batches
 from diffrast._stored import stored, zero_after
 
-_Lists: TypeAlias = tuple[Array, Array, Array, Array]  # two, and the lengths of both
+_Lists: TypeAlias = tuple[list[Array], list[Array]]  # one of each kind, and their lengths
 
 PARTS_AT_ONCE = 1024  # parts of pixels that are shaded side by side on a CPU,
 _FEW = 128  # or in small images
@@ -45,11 +46,13 @@ class Turning(NamedTuple):
 class Chosen(NamedTuple):
     """The pixels that are shaded at more points, those that edges part last.
 
-    These have no derivative here, and are shaded in four quarters if there is room.
+    These are shaded in four quarters if there is room, and have no derivative here, but for those
+    where colours turn sharply, which come before the others.
     """
 
     number: Int[Array, " places"]
     plain: Int[Array, ""]  # so many that edges do not part,
+    moving: Int[Array, ""]  # that have a derivative,
     total: Int[Array, ""]  # and all
 
     @property
@@ -66,7 +69,15 @@ class Chosen(NamedTuple):
     @property
     def parts(self) -> Int[Array, ""]:
         """How many there are of all pixels."""
-        return self.plain + self.parts_of_each * (self.total - self.plain)
+        return self._parts_of(self.total)
+
+    @property
+    def moving_parts(self) -> Int[Array, ""]:
+        """How many there are of those that have a derivative."""
+        return self._parts_of(self.moving)
+
+    def _parts_of(self, count: Array) -> Int[Array, ""]:
+        return self.plain + self.parts_of_each * (count - self.plain)
 
 
 def find_turning(
@@ -101,7 +112,8 @@ def bending(turning: Turning, image: Float[Array, "height width 3"]) -> Chosen:
     # What the background shows, or an edge changes, is not a number.
     color = jnp.where(jnp.pad(parted, 1) | (face_image < 0), jnp.nan, _sums(hard))
     bends = stored(jnp.where(turning.chosen, jnp.inf, _bends(color)))
-    return _largest(bends, _least(mean), parted)
+    kind = stored(jnp.where(parted, jnp.where(turning.sharp, 1, 2), 0).astype(jnp.int8))
+    return _largest(bends, _least(mean), kind)
 
 
 def _sums(image: Array) -> Array:
@@ -138,8 +150,8 @@ def _bend(one: Array, middle: Array, other: Array) -> Array:
     return jnp.abs(jnp.where(both == both, both, alone))
 
 
-def _largest(values: Array, least: Array, last: Array) -> Chosen:
-    """The pixels with more than the least value, those of which `last` is true behind the others.
+def _largest(values: Array, least: Array, kind: Int[Array, "height width"]) -> Chosen:
+    """The pixels with more than the least value: those of the kind 0, then 1, then 2.
 
     If these are too many, those with more than twice, four times, ... as much. Blocks of pixels
     one below the other are looked through: their largest values are quick to find.
@@ -151,35 +163,36 @@ def _largest(values: Array, least: Array, last: Array) -> Chosen:
     some = at_once(_BLOCKS_AT_ONCE, blocks.size)
 
     def are_few(found: _Lists) -> Array:
-        return found[2] + found[3] <= places
+        return reduce(jnp.add, found[1]) <= places
 
     def look(state: tuple[Array, _Lists]) -> tuple[Array, _Lists]:
-        least, (ahead, behind, _, _) = state
+        least, (lists, _) = state
         order, size = compacted(blocks > least, jnp.arange(blocks.size, dtype=jnp.int32))
 
         def add(block: Array, exists: Array, found: _Lists) -> _Lists:
-            ahead, behind, before, after = found
             row, column = divided(block, width)
             first = row * (_BLOCK * width) + column
             number = first + width * jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
             value = values.reshape(-1).at[number].get(mode="fill", fill_value=0)
-            chosen = stored(exists & (value > least)).reshape(-1)
-            is_last = last.reshape(-1).at[number].get(mode="clip").reshape(-1)
-            one, more = compacted(chosen & ~is_last, number.reshape(-1))
-            other, rest = compacted(chosen & is_last, number.reshape(-1))
-            ahead = lax.dynamic_update_slice(ahead, one, (before,))
-            behind = lax.dynamic_update_slice(behind, other, (after,))
-            return ahead, behind, before + more, after + rest
+            of_kind = kind.reshape(-1).at[number].get(mode="clip")
+            of_kind = stored(jnp.where(exists & (value > least), of_kind, -1)).reshape(-1)
+            lists, sizes = [], []
+            for k, (known, size) in enumerate(zip(*found, strict=True)):
+                more, count = compacted(of_kind == k, number.reshape(-1))
+                lists.append(lax.dynamic_update_slice(known, more, (size,)))
+                sizes.append(size + count)
+            return lists, sizes
 
-        zero = zero_after(size)
-        start = jnp.zeros_like(ahead), jnp.zeros_like(behind), zero, zero
-        return 2 * least, over_batches(order, size, some, add, start, goes_on=are_few)
+        nothing = [jnp.zeros_like(one) for one in lists], [zero_after(size)] * len(lists)
+        return 2 * least, over_batches(order, size, some, add, nothing, goes_on=are_few)
 
     zero = zero_after(blocks[0]).astype(jnp.int32)
     room = jnp.zeros(places + _BLOCK * some, jnp.int32) + zero
-    start = least, (room, room, zero + places + 1, zero)
-    _, found = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    ahead, behind, before, after = found
+    start = least, ([room] * 3, [zero + places + 1, zero, zero])
+    _, (lists, sizes) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
     place = jnp.arange(places)
-    number = jnp.where(place < before, ahead[place], behind[jnp.maximum(place - before, 0)])
-    return Chosen(number, before, before + after)
+    plain, sharp, others = sizes
+    moving = plain + sharp
+    number = jnp.where(place < plain, lists[0][place], lists[1][jnp.maximum(place - plain, 0)])
+    number = jnp.where(place < moving, number, lists[2][jnp.maximum(place - moving, 0)])
+    return Chosen(number, plain, moving, moving + others)

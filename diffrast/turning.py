@@ -5,10 +5,13 @@ or has a highlight no larger than a pixel, its colour turns within the pixel. Su
 how colours bend from each to the next ones, are shaded at four more points of the surface at their
 centre, and get its mean colour. Those that edges part are shaded at sixteen, as far as nothing
 hides the surface there.
+
+How the mean changes is what edges weigh, too: of a highlight narrower than a pixel the colour at
+the centre may change by any amount.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -77,8 +80,8 @@ def turns(
 ) -> Finish:
     """What gives an image with edges the mean colours of pixels in which colours turn.
 
-    It is the change of these means that edges weigh, in place of that of the colours at centres: of
-    a highlight narrower than a pixel this may be any number. No second derivatives.
+    Edges weigh the change of these means in place of that of the colours at centres. No second
+    derivatives.
 
     Args:
         shade: colours of points, one array a channel; its first argument is `data`.
@@ -131,11 +134,7 @@ def _find(given: _Given, image: Float[Array, "height width 3"]) -> PointsWithin:
         row, column = divided(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
         face = faces_at(chosen, turning.face_image, clip, faces, topology, apart, volume)
-        wanted = (jnp.arange(chosen.number.size) < chosen.plain) | stored(
-            turning.sharp.reshape(-1)[chosen.number]
-        )
-        seen = jnp.where(wanted, number_seen(chosen, face), 0)
-        return PointsWithin(chosen, stored(seen.astype(jnp.int8)), face, lit)
+        return PointsWithin(chosen, number_seen(chosen, face), face, lit)
 
     seen = lax.stop_gradient((given.fixed, image, drawn.positions_clip, drawn.faces))
     return over_views(find, image.shape[0] * width)(*seen)
@@ -152,7 +151,8 @@ def _added(
         def step(n: Array, total: Array) -> Array:
             parts = parts_of(points.chosen, n, count)
             colors = _colors(shade, size, colored, points, parts, n)
-            return total.at[parts.place].add(stored(_means(colors, points, parts, n)))
+            weight = jnp.where(parts.points > 0, 1 / 16, 1 / 4)
+            return total.at[parts.place].add(stored(_sums(colors, points, parts, n, weight)))
 
         start = _nothing(colored, points) + varying_zero((colored, points))
         return over_parts(points.chosen, count, step, start)
@@ -170,9 +170,10 @@ def _change(
 ) -> Float[Array, "places 3"]:
     """By how much more the mean colours of pixels change than those at their centres.
 
-    The means are of what is seen of the surface, and bounded by `_share_of_change`.
+    The means are of what is seen of the surface, and of no more change than `_share_of_change`. Of
+    those that edges part only where colours turn sharply: else the centre's change is as good.
     """
-    fixed = colored, points, hard = varying_alike(lax.stop_gradient((colored, points, hard)))
+    fixed = varying_alike((colored, points, hard))
     leaves, tree = jax.tree.flatten(colored)
     known = enumerate(jax.tree.leaves(changes))
     moving = {i: change for i, change in known if not isinstance(change, SymbolicZero)}
@@ -181,27 +182,25 @@ def _change(
         """Places, and their means as a function of what moves, which is given as well."""
         colored, points, hard = fixed
         leaves = jax.tree.leaves(colored)
-        parts = parts_of(points.chosen, n, points.chosen.parts)
+        parts = parts_of(points.chosen, n, points.chosen.moving_parts)
         row, column = divided(points.chosen.number[parts.place], size[1])
         around = stored(pixels_round(hard, column, row))
-        at_points = partial(_colors, shade, size, colored, points, parts, n)
-        share = _share_of_change(at_points, around)
-        seen = points.seen[parts.place].astype(share.dtype)
-        all_points = jnp.where(parts.points > 0, 16, 4)
-        over_seen = jnp.where(seen > 0, all_points / jnp.maximum(seen, 1), 0).astype(share.dtype)
-        over_seen = stored(over_seen)
+        at = partial(_colors, shade, size, points=points, parts=parts, n=n)
+        beside = [at(colored, shift=shift) for shift in ((_BESIDE, 0.0), (0.0, _BESIDE))]
+        weight = 1 / jnp.maximum(points.seen[parts.place], 1).astype(hard.dtype)
 
         def means(values: list[Array]) -> Array:
             given = dict(zip(moving, values, strict=True))
             moved = jax.tree.unflatten(tree, [given.get(i, leaf) for i, leaf in enumerate(leaves)])
-            colors = _colors(shade, size, moved, points, parts, n)
-            return over_seen[:, None] * _means(colors, points, parts, n, share)
+            colors = at(moved)
+            share = _share_of_change(lax.stop_gradient(colors), beside, around)
+            return _sums(colors, points, parts, n, weight, share)
 
         return parts.place, means, [leaves[i] for i in moving]
 
     def over_batches_of(fixed: Any, step: Callable[[Array, Any], Any], start: Any) -> Any:
         chosen = fixed[1].chosen
-        return over_parts(chosen, chosen.parts, step, start)
+        return over_parts(chosen, chosen.moving_parts, step, start)
 
     def push(fixed: Any, changes: list[Array], nothing: Array) -> Array:
         def step(n: Array, total: Array) -> Array:
@@ -241,7 +240,7 @@ def _colors(
     points: PointsWithin,
     parts: Parts,
     n: Array,
-    shift: Float[Array, "2"] | None = None,
+    shift: tuple[float, float] = (0.0, 0.0),
 ) -> list[Float[Array, "points some"]]:
     """The colours at the points of parts of the batch `n`, all shifted to the right and down."""
     data, drawn = colored
@@ -249,9 +248,8 @@ def _colors(
     face = faces_of(points, parts, n)
     full = size[0] + 2, size[1] + 2
     pixels = pixels_at(face, row + 1, column + 1, full, drawn.positions_clip.dtype)
-    right, down = jnp.asarray(POINTS)[:, :, parts.points]
-    if shift is not None:
-        right, down = right + shift[0], down + shift[1]
+    moved = POINTS + np.array(shift, np.float32)[:, None, None]
+    right, down = jnp.asarray(moved)[:, :, parts.points]
     x, y = pixels.x + 2 * right, pixels.y - 2 * down
     flat, x, y = stored_together([part.reshape(-1) for part in (face, x, y)])
     # Stored, and the colours: in what repeats rows no loop is vectorised.
@@ -261,38 +259,45 @@ def _colors(
     return [color.reshape(face.shape) for color in stored(shade(data, seen, lit))]
 
 
-def _means(
+def _sums(
     colors: list[Float[Array, "points some"]],
     points: PointsWithin,
     parts: Parts,
     n: Array,
+    weight: Float[Array, " some"],
     share: Float[Array, "points_but_one some"] | None = None,
 ) -> Float[Array, "some 3"]:
-    """The means of colours less those at the centres; of what is not seen, edges tell.
+    """The weighted sums of colours less those at the centres; of what is not seen, edges tell.
 
     With a share of each point's colour, these are for derivatives alone.
     """
     used = (faces_of(points, parts, n)[1:] >= 0) & parts.exists
-    quarter = jnp.array(0.25, colors[0].dtype)
-    part = jnp.where(parts.points > 0, quarter, 1)  # of the pixel
     others = [color[1:] if share is None else share * color[1:] for color in colors]
     more = [other - color[0] for other, color in zip(others, colors, strict=True)]
-    return jnp.stack([part * jnp.mean(jnp.where(used, m, 0), axis=0) for m in more], axis=-1)
+    return jnp.stack([weight * jnp.sum(jnp.where(used, m, 0), axis=0) for m in more], axis=-1)
 
 
 def _share_of_change(
-    colors_at: Callable[..., list[Array]], around: Float[Array, "9 some 3"]
+    colors: list[Float[Array, "points some"]],
+    beside: list[list[Float[Array, "points some"]]],
+    around: Float[Array, "9 some 3"],
 ) -> Float[Array, "points_but_one some"]:
     """How much of their change counts at points: less where it is over within less than a pixel.
 
     The change of a pixel's mean is no more than what its colours differ by while they pass, but
     that at a point is as large as a slope is steep: it is cut to what the colours round the pixel
     allow.
+
+    Args:
+        colors: at the points.
+        beside: a little to the right of them, and below.
+        around: at the 3×3 pixels.
     """
-    shifts = jnp.asarray(np.array([[0, 0], [_BESIDE, 0], [0, _BESIDE]], np.float32))
-    colors = jax.vmap(lambda shift: jnp.stack(colors_at(shift=shift)))(shifts)
-    right, down = jnp.sum(jnp.abs(colors[1:] - colors[0]), axis=1) / _BESIDE
-    steepness = jnp.sqrt(right * right + down * down)[1:]
+    right, down = (
+        reduce(jnp.add, [abs(a - b)[1:] for a, b in zip(aside, colors, strict=True)]) / _BESIDE
+        for aside in beside
+    )
+    steepness = jnp.sqrt(right * right + down * down)
     most = _STEEP * jnp.sum(jnp.max(around, axis=0) - jnp.min(around, axis=0), axis=-1)
     steep = steepness > most
     return stored(jnp.where(steep, most / jnp.where(steep, steepness, 1), 1))

@@ -44,9 +44,7 @@ class PointsWithin(NamedTuple):
     """What is seen at points of the chosen pixels."""
 
     chosen: Chosen
-    # Points of each where this surface is seen; 0 where the change at the centre is as good: edges
-    # part it, and its colours do not turn sharply.
-    seen: Int[Array, " places"]
+    seen: Int[Array, " places"]  # points of each where this surface is seen
     face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
     reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
 
@@ -184,7 +182,8 @@ def number_seen(chosen: Chosen, face: Int[Array, "points parts"]) -> Int[Array, 
     """At how many points of each pixel its surface is seen, without the centres."""
     place, _ = place_of(chosen, jnp.arange(face.shape[1], dtype=jnp.int32))
     of_parts = stored(jnp.sum(face[1:] >= 0, axis=0, dtype=jnp.int32))
-    return jnp.zeros(chosen.number.size, jnp.int32).at[place].add(of_parts)
+    seen = jnp.zeros(chosen.number.size, jnp.int32).at[place].add(of_parts)
+    return stored(seen.astype(jnp.int8))
 
 
 def faces_of(points: PointsWithin, parts: Parts, n: Array) -> Int[Array, "points some"]:

@@ -64,7 +64,7 @@ def test_the_derivative_of_narrow_highlights_is_that_of_whole_pixels():
         moved = scene(mesh, shift=jnp.array([0, 0, 1]) * shift)
         return dr.render(moved, view, settings(64, **options))
 
-    half = 0.03  # of a pixel
+    half = 0.03  # a pixel
     exact = jax.jit(lambda shift: picture(shift, antialias=False, samples=256))
     want = (np.asarray(exact(half)) - np.asarray(exact(-half))) / (2 * half)
     got = jax.jit(lambda: jax.jvp(picture, (0.0,), (1.0,))[1])()
@@ -86,13 +86,15 @@ def test_whatever_edges_are_told_of_gets_its_mean(rough):
     hard = jnp.asarray(0.5 + noise, jnp.float32)
     parts = rng.uniform(size=(height, width, 1)) < 0.3
     found = bending.find_turning(face, hard)
-    number, plain, total = bending.bending(found, hard[1:-1, 1:-1] + 0.1 * parts)
+    number, plain, moving, total = bending.bending(found, hard[1:-1, 1:-1] + 0.1 * parts)
     listed = np.asarray(number[:total])
     assert 0 < plain < total <= number.size < height * width / 2
     assert len(set(listed)) == total
     assert set(np.flatnonzero(found.chosen)) <= set(listed)
     assert np.any(found.chosen)
     np.testing.assert_array_equal(parts.reshape(-1)[listed], np.arange(total) >= plain)
+    sharp = np.asarray(found.sharp).reshape(-1)[listed[plain:]]
+    np.testing.assert_array_equal(sharp, np.arange(plain, total) < moving)
 
 
 def parameters_of(values):
@@ -138,7 +140,8 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
         chosen = points.chosen
         assert 32 < chosen.plain < chosen.total <= chosen.number.size
         all_seen = jnp.full(chosen.number.size, 4, jnp.int8)
-        plain = points._replace(chosen=chosen._replace(total=chosen.plain), seen=all_seen)
+        only = chosen._replace(moving=chosen.plain, total=chosen.plain)
+        plain = points._replace(chosen=only, seen=all_seen)
         hard = jnp.zeros((42, 42, 3)).at[::2].set(1e9)  # so that no slope is too steep
 
         def colored(vertices, direction):
@@ -159,7 +162,7 @@ def test_what_is_added_has_its_own_derivative(monkeypatch):
             first = jnp.zeros((), jnp.int32)
             parts = within.parts_of(plain.chosen, first, chosen.plain)
             colors = turning._colors(shade, size, colored(*values), plain, parts, first)
-            return turning._means(colors, plain, parts, first)
+            return turning._sums(colors, plain, parts, first, jnp.full(chosen.number.size, 0.25))
 
         @jax.custom_jvp
         def added_to(given):

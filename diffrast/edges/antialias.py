@@ -232,10 +232,10 @@ def antialias_image(
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(*primals)
         now = rest._replace(image=image, positions_clip=positions_clip)
-        now, (records, rims, found) = lax.stop_gradient((now, made_of))
+        now, data, (records, rims, found) = lax.stop_gradient((now, data, made_of))
         d_means = d_image
         if finish is not None:
-            d_means = finish.change(lax.stop_gradient(data), found, tangents[3], d_image)
+            d_means = finish.change(data, found, tangents[3], d_image)
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels), d_means.reshape(-1, channels)
         d_out = apply_linear(now, method, records, rims, points, colors)
