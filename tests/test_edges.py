@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import diffrast as dr
+from diffrast._selection import prefix_sum
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.antialias import with_depth
 from diffrast.edges.blend import Method, View
-from diffrast.edges.collect import collect, unseen_faces
+from diffrast.edges.collect import collect, survey
 from diffrast.edges.derivative import apply_linear
 from diffrast.edges.neighborhood import Surface, walk
 from diffrast.edges.pieces import (
@@ -20,10 +21,12 @@ from diffrast.edges.pieces import (
     Pieces,
     Waiting,
     clip_edges,
+    cut,
     facing,
     first_ones,
     to_pixels,
     usual_batches,
+    with_runs,
 )
 from diffrast.edges.rim import _border
 
@@ -393,7 +396,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
         method = Method(None, None, False, capacity)
-        found = view._replace(unseen=unseen_faces(view, method))
+        found = view._replace(survey=survey(view, method))
         records, sums = collect(found, method)
 
         def change(points, colors):
@@ -410,7 +413,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
         )
 
     many = results(4096)
-    for capacity in (100, 440):  # less than a batch finds, and more; the last end among the lines
+    for capacity in (100, 400):  # less than a batch finds, and more; the last end among the lines
         few = results(capacity)
         assert 2 * capacity < many[0] == few[0]
         for a, b in zip(jax.tree.leaves(many[1:]), jax.tree.leaves(few[1:]), strict=True):
@@ -596,3 +599,93 @@ def test_depths_at_which_a_rim_takes_the_colour_that_it_carries_along(angle, dep
     chord = 2 * np.mean(np.max(np.abs(on_rim), axis=0) <= 0.5)
     found = weight * border[0] + (1 - weight) * border[1]
     np.testing.assert_allclose(found * chord, inner.mean(), atol=2e-3)
+
+
+def cut_edges(size, number):
+    """The edges of random triangles, and all pieces of a picture that they are cut into."""
+    points = np.random.default_rng(4).uniform((-2, -2, 1), (2, 2, 3), size=(number, 3, 3))
+    points[1::2] = points[1::2, :1] + 0.1 * (points[1::2] - points[1::2, :1])  # small ones
+    clip = jnp.asarray(
+        np.concatenate([points, points[..., 2:]], axis=2).reshape(-1, 4), jnp.float32
+    )
+    faces = jnp.arange(3 * number).reshape(-1, 3)
+    pixels = to_pixels(clip, size, size)
+    edges = traced_topology(clip, faces).edges
+    numbers = jnp.arange(3 * number)
+    segments = clip_edges(
+        numbers,
+        numbers >= 0,
+        edges,
+        faces,
+        pixels,
+        clip[:, 2] - 1,
+        facing(pixels, faces),
+        height=size,
+        width=size,
+    )
+
+    def pieces_of(segments):
+        ends = prefix_sum(segments.places)
+        at_once = int(ends[-1]) + 1
+        return cut(segments, ends, jnp.int32(0), at_once=at_once, height=size, width=size)
+
+    return segments, pieces_of
+
+
+def test_runs_that_hold_pieces_are_cut_again():
+    """Those alone, into the same pieces, however pieces are noted; edges are of 1 to 90 pieces."""
+    segments, pieces_of = cut_edges(90, 40)
+    pieces = pieces_of(segments)
+    parts, edge = np.asarray(segments.parts), np.asarray(pieces.segment)
+    assert parts.max() > 64
+    assert 0 < parts[parts > 0].min() < 32
+    random = np.random.default_rng(0)
+    wanted = np.asarray(pieces.exists) & (random.uniform(size=parts.size) < 0.5)[edge]
+    wanted &= random.uniform(size=edge.size) < 0.2
+    found = [column[..., np.flatnonzero(wanted)] for column in pieces]
+    runs, last = jnp.zeros(parts.size, jnp.uint32), jnp.int32(-1)
+    for first in range(0, wanted.sum(), 50):  # and 7 that do not exist
+        number = np.arange(first, first + 57)
+        noted = Pieces(*(column[..., np.minimum(number, wanted.sum() - 1)] for column in found))
+        noted = noted._replace(exists=jnp.asarray(number < min(first + 50, wanted.sum())))
+        runs, last = with_runs(runs, last, noted, segments, jnp.arange(parts.size))
+
+    length = np.maximum(np.asarray(segments.run_length), 1)
+    order = np.arange(edge.size) - (np.cumsum(parts) - parts)[edge]
+    expected = np.zeros(parts.size, np.uint32)
+    run = order // length[edge]
+    np.bitwise_or.at(expected, edge[wanted], np.uint32(1) << run[wanted].astype(np.uint32))
+    np.testing.assert_array_equal(runs, expected)
+
+    again = pieces_of(segments._replace(runs=runs))
+    assert again.exists.size < 0.6 * edge.size
+    in_runs = np.asarray(pieces.exists) & ((expected[edge] >> run.astype(np.uint32)) % 2 > 0)
+    assert in_runs.sum() > wanted.sum()
+    for new, old in zip(again[:3], pieces[:3], strict=True):
+        np.testing.assert_array_equal(
+            np.asarray(new)[..., np.asarray(again.exists)], np.asarray(old)[..., in_runs]
+        )
+
+
+def test_edges_behind_a_face_are_not_cut_again():
+    ball = dr.shapes.icosphere(2)
+    wall = dr.Mesh(vertices=[[-9, -9, 1.5], [9, -9, 1.5], [0, 9, 1.5]], faces=[[0, 1, 2]])
+    mesh = dr.mesh.merge([dr.Mesh(vertices=ball.vertices, faces=ball.faces), wall])
+    view = camera(eye=(0.0, 0.0, 3.0))
+    clip = dr.world_to_clip(view, mesh.vertices)
+    face = dr.rasterize(clip, mesh.faces, height=20, width=24, border=1).face
+    assert int(face.min()) >= len(ball.faces)
+    edges = with_depth(
+        View(
+            positions_clip=clip,
+            faces=mesh.faces,
+            turned=None,
+            topology=mesh.topology,
+            apart=jnp.zeros_like(mesh.topology.edges.seam),
+            face_image=face,
+            image=jnp.zeros((22, 26, 3)),
+            background=jnp.zeros(3),
+            scene=None,
+        )
+    )
+    assert not np.any(survey(edges, Method(None, None, False, 0)).runs)

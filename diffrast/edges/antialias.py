@@ -16,7 +16,7 @@ from diffrast._linear import without_known_zeros
 from diffrast._stored import stored
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
-from diffrast.edges.collect import collect, unseen_faces
+from diffrast.edges.collect import collect, survey
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
@@ -198,8 +198,8 @@ def antialias_image(
     capacity = ROWS_AT_ONCE * max(4, height * width // (10 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
-    find = over_views(lambda view: unseen_faces(view, method), height * width)
-    view = view._replace(unseen=find(lax.stop_gradient(view)))
+    find = over_views(lambda view: survey(view, method), height * width)
+    view = view._replace(survey=find(lax.stop_gradient(view)))
 
     def gather(view: View, method: Method) -> Blended:
         found: Blended = over_views(lambda view: collect(view, method), height * width)(view)

@@ -27,7 +27,7 @@ from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, light_told
-from diffrast.edges.visibility import BACKGROUND, Seen, Unseen
+from diffrast.edges.visibility import BACKGROUND, Seen, Survey
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 _SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
@@ -53,7 +53,7 @@ class View(NamedTuple):
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
-    unseen: Unseen | None = None
+    survey: Survey | None = None
 
 
 class Method(NamedTuple):

@@ -5,14 +5,14 @@ a batch is under `jax.jit`, which traces it once.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, lanes
-from diffrast._selection import batches_of, divided, over_batches, prefix_sum
+from diffrast._selection import batches_of, divided, over_batches, prefix_sum, selected
 from diffrast._stored import stored, stored_together, zero_after
 from diffrast.edges.blend import (
     Blended,
@@ -26,7 +26,6 @@ from diffrast.edges.blend import (
 )
 from diffrast.edges.neighborhood import Surface, near_background
 from diffrast.edges.pieces import (
-    Pieces,
     Segments,
     Waiting,
     behind,
@@ -39,6 +38,7 @@ from diffrast.edges.pieces import (
     none_waiting,
     to_pixels,
     usual_batches,
+    with_runs,
 )
 from diffrast.edges.piercing import (
     LINES_AT_ONCE,
@@ -54,9 +54,10 @@ from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
 from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
-from diffrast.edges.visibility import Unseen, look, uncovered, unpictured
+from diffrast.edges.visibility import Survey, Unseen, look, uncovered, unpictured
 
 Nearest = tuple[Float[Array, " pixels"], Int[Array, " pixels"]]  # 1/w of faces, and which
+Found = tuple[Any, ...]  # bits of edges' runs, and one or two of these
 Add = Callable[[Int[Array, " n"], Bool[Array, " n"], Blended], Blended]
 
 
@@ -108,21 +109,25 @@ def collect(view: View, method: Method, start: Start | None = None) -> Blended:
     return blended
 
 
-def unseen_faces(view: View, method: Method) -> Unseen:
-    """What is to be the view's `unseen`."""
+def survey(view: View, method: Method) -> Survey:
+    """What is to be the view's `survey`."""
     bodies = view.topology.bodies
-    edges = _Edges(view, _surface(view, method))
+    surface = _surface(view, method)
+    edges = _Edges(view, surface, choose_edges(view.topology.edges, surface.volume, view.apart))
     seen = None if bodies is None else bodies_round(view.face_image, bodies)
 
-    def add(edge: Array, exists: Array, total: list[Nearest]) -> list[Nearest]:
+    def add_edges(edge: Array, exists: Array, total: Found) -> Found:
         segments = edges.clipped(edge, exists)
         ends, cuts = edges.cuts(segments)
 
-        def add_cut(state: tuple[Array, list[Nearest]]) -> tuple[Array, list[Nearest]]:
-            n, (far, *near) = state
-            pieces = edges.pieces(segments, ends, n)
+        def add_pieces(state: tuple[Array, Waiting, Array, Found]) -> Any:
+            n, waiting, last, (runs, far, *near) = state
+            n, waiting = edges.until_enough(segments, ends, cuts, n, waiting)
+            number = jnp.arange(waiting.pieces.exists.size, dtype=jnp.int32)
+            pieces = waiting.pieces._replace(exists=number < waiting.total)
+            runs, last = with_runs(runs, last, pieces, segments, edge)
             face, depth = stored_together(
-                unpictured(pieces, segments, edges.surface.volume, view.face_image)
+                unpictured(pieces, segments, surface.volume, view.face_image)
             )
             pixel = number_of_pixel(view, pieces.pixel)
             if bodies is not None and seen is not None:
@@ -130,21 +135,25 @@ def unseen_faces(view: View, method: Method) -> Unseen:
                 body = ranks(bodies[jnp.maximum(face, 0)], bodies.size)
                 other = jnp.any(seen[:, row, column] > body, axis=0)
                 near = [_nearer(near[0], pixel, stored((face >= 0) & other), face, depth)]
-            return n + 1, [_nearer(far, pixel, face >= 0, face, -depth), *near]
+            far = _nearer(far, pixel, face >= 0, face, -depth)
+            return n, waiting._replace(total=waiting.total & 0), last, (runs, far, *near)
 
-        def is_left(state: tuple[Array, list[Nearest]]) -> Array:
+        def is_left(state: tuple[Array, Waiting, Array, Found]) -> Array:
             return anywhere(state[0] < cuts)
 
-        return lax.while_loop(is_left, add_cut, (ends[-1] & 0, total))[1]
+        zero = ends[-1] & 0
+        start = zero, edges.none_waiting(segments), zero - 1, total
+        return lax.while_loop(is_left, add_pieces, start)[-1]
 
     size = edges.height, edges.width
     nowhere = jnp.full(edges.height * edges.width, -1, view.face_image.dtype) + (edges.count & 0)
     nothing = nowhere.astype(view.positions_clip.dtype) - jnp.inf, nowhere
-    start = [nothing] * (1 if bodies is None else 2)
-    found = over_batches(edges.order, edges.count, edges.at_once.edges, add, start)
+    no_runs = jnp.zeros(view.apart.size, jnp.uint32) + (edges.count & 0).astype(jnp.uint32)
+    start: Found = (no_runs, *[nothing] * (1 if bodies is None else 2))
+    runs, *found = over_batches(edges.order, edges.count, edges.at_once.edges, add_edges, start)
     # Held by all that follows: numbers of few faces take two bytes.
     few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
-    return Unseen(*(stored(face.astype(few)).reshape(size) for _, face in found))
+    return Survey(runs, Unseen(*(stored(face.astype(few)).reshape(size) for _, face in found)))
 
 
 def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Array) -> Nearest:
@@ -171,10 +180,10 @@ def _surface(view: View, method: Method) -> Surface:
 class _Edges:
     """The edges of the mesh across which the picture may jump."""
 
-    def __init__(self, view: View, surface: Surface):
+    def __init__(self, view: View, surface: Surface, chosen: tuple[Array, Array]):
         self.height, self.width = view.image.shape[0] - 2, view.image.shape[1] - 2
         self.view, self.surface = view, surface
-        self.order, self.count = choose_edges(view.topology.edges, surface.volume, view.apart)
+        self.order, self.count = chosen
         self.z = stored(view.positions_clip[:, 2])
         self.at_once = usual_batches(view.apart.size, self.height * self.width)
 
@@ -195,15 +204,29 @@ class _Edges:
 
     def cuts(self, segments: Segments) -> tuple[Array, Array]:
         """Sums of how many pieces edges have, and how many cuts make them."""
-        ends = prefix_sum(segments.parts)
+        ends = prefix_sum(segments.places)
         return ends, batches_of(ends[-1], self.at_once.cut)
 
-    def pieces(self, segments: Segments, ends: Array, n: Array) -> Pieces:
-        """Those of a cut that may be seen."""
-        size = {"height": self.height, "width": self.width}
-        at_once = self.at_once.cut
-        pieces = cut(segments, ends, n * at_once, at_once=at_once, **size)
-        return uncovered(pieces, segments, self.surface, self.view.face_image)
+    def none_waiting(self, segments: Segments) -> Waiting:
+        """Room for the pieces that may wait."""
+        return none_waiting(segments, self.at_once.cut + self.at_once.pieces)
+
+    def until_enough(
+        self, segments: Segments, ends: Array, cuts: Array, n: Array, waiting: Waiting
+    ) -> tuple[Array, Waiting]:
+        """Cut on, from cut `n`, until as many pieces that may be seen wait as are taken at once."""
+        at_once, size = self.at_once, {"height": self.height, "width": self.width}
+
+        def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
+            n, waiting = state
+            pieces = cut(segments, ends, n * at_once.cut, at_once=at_once.cut, **size)
+            pieces = uncovered(pieces, segments, self.surface, self.view.face_image)
+            return n + 1, behind(waiting, *gathered(pieces))
+
+        def are_few(state: tuple[Array, Waiting]) -> Array:
+            return (state[0] < cuts) & (state[1].total < at_once.pieces)
+
+        return lax.while_loop(are_few, add_cut, (n, waiting))
 
 
 def _edges(
@@ -213,25 +236,18 @@ def _edges(
     goes_on: Callable[[Blended], Array] | None,
 ) -> Work:
     """The edges of the mesh; within a batch of them, too, only while `goes_on(total)`."""
-    edges = _Edges(view, surface)
+    assert view.survey is not None
+    runs, unseen = view.survey
+    edges = _Edges(view, surface, selected(runs > 0))
     near_bare = near_background(view.face_image)
-    at_once, unseen = edges.at_once, view.unseen
-    assert unseen is not None
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
-        segments = edges.clipped(edge, exists)
+        segments = edges.clipped(edge, exists)._replace(runs=stored(runs[edge]))
         ends, cuts = edges.cuts(segments)
 
-        def add_cut(state: tuple[Array, Waiting]) -> tuple[Array, Waiting]:
-            n, waiting = state
-            return n + 1, behind(waiting, *gathered(edges.pieces(segments, ends, n)))
-
-        def are_few(state: tuple[Array, Waiting]) -> Array:
-            return (state[0] < cuts) & (state[1].total < at_once.pieces)
-
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
-            n, waiting = lax.while_loop(are_few, add_cut, state[:2])
-            pieces = first_ones(waiting, at_once)
+            n, waiting = edges.until_enough(segments, ends, cuts, *state[:2])
+            pieces = first_ones(waiting, edges.at_once)
             found, left = look(pieces, segments, surface, view.face_image, near_bare, unseen)
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
@@ -240,19 +256,19 @@ def _edges(
             left = (state[0] < cuts) | (state[1].total > 0)
             return anywhere(left) if goes_on is None else left & goes_on(state[2])
 
-        start = ends[-1] & 0, none_waiting(segments, at_once.cut + at_once.pieces), total
+        start = ends[-1] & 0, edges.none_waiting(segments), total
         return lax.while_loop(is_left, add_pieces, start)[2]
 
-    return Work(edges.order, edges.count, at_once.edges, add_edges)
+    return Work(edges.order, edges.count, edges.at_once.edges, add_edges)
 
 
 def _piercing(view: View, method: Method, surface: Surface) -> Work:
     """The lines along which surfaces pierce each other."""
     bodies, width = view.topology.bodies, view.image.shape[1] - 2
     assert bodies is not None
-    assert view.unseen is not None
-    assert view.unseen.nearest is not None
-    unseen = view.unseen.nearest.reshape(-1)
+    assert view.survey is not None
+    assert view.survey.unseen.nearest is not None
+    unseen = view.survey.unseen.nearest.reshape(-1)
     order, count = choose_pixels(view.face_image, bodies, unseen)
     lines_at_once = lanes() * LINES_AT_ONCE
 

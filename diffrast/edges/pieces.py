@@ -7,6 +7,10 @@ homogeneous coordinates, projected, and cut where it passes from one pixel to th
 Cutting. Along a line with both coordinates growing, the sum of the floors of x and y grows by one
 from pixel to pixel, and every pixel's part of the line contains its point where x + y is a whole
 number one larger: so piece k of a line is found without walking along it, all at once.
+
+Where many surfaces lie one behind the other nearly all pieces are hidden. So all are cut once to
+find out which may be seen, in up to 32 runs of each edge's pieces, and only those runs are cut
+again.
 """
 
 import math
@@ -18,10 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 from diffrast._device import lanes, views_fill_lanes
-from diffrast._selection import compacted, prefix_sum, selected
+from diffrast._selection import compacted, divided, prefix_sum, selected
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Edges, by_three
 from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, nearest_first
@@ -29,6 +33,7 @@ from diffrast.edges.planes import FINE_TOLERANCE, Table, cross_rows, largest, ne
 PIECES_AT_ONCE = 256, 512
 OF_MANY_VIEWS = 128  # where others would wait for the view that has most
 FEW = 32  # pieces, each of which is looked at in parts
+RUNS = 32  # of an edge's pieces, for each of which there is a bit
 _EDGE_ON = 8  # roundings in the volume of a face
 
 
@@ -57,6 +62,19 @@ class Segments(NamedTuple):
     weights: Float[Array, "2 n"]  # 1/w at start and end
     range: Float[Array, "2 n"]  # of the clipped part on the edge, 0 to 1
     parts: Int[Array, " n"]  # as many pieces
+    runs: UInt32[Array, " n"] | None = None  # bits of the runs that are cut; None for all pieces
+
+    @property
+    def run_length(self) -> Int[Array, " n"]:
+        """Pieces in each run of an edge; its last one may hold fewer."""
+        return divided(self.parts + (RUNS - 1), RUNS)[0]
+
+    @property
+    def places(self) -> Int[Array, " n"]:
+        """How many places there are for pieces in what is cut."""
+        if self.runs is None:
+            return self.parts
+        return self.run_length * lax.population_count(self.runs).astype(jnp.int32)
 
 
 class Pieces(NamedTuple):
@@ -260,7 +278,7 @@ def cut(
     height: int,
     width: int,
 ) -> Pieces:
-    """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their counts."""
+    """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their `places`."""
     number = first_piece + jnp.arange(at_once)
     # As many segments end before or at each piece's number. Those at the very end do not count:
     # they may be many, and a GPU would take them one after another.
@@ -268,7 +286,12 @@ def cut(
     ended = jnp.zeros(at_once, jnp.int32).at[end].add(1, mode="drop")
     segment = stored(prefix_sum(ended))
     exists = number < ends[-1]
-    k = number - (ends - segments.parts)[segment]
+    k = number - (ends - segments.places)[segment]
+    if segments.runs is not None:
+        length = segments.run_length[segment]
+        run, within = divided(k, jnp.maximum(length, 1))
+        k = _set_bit(segments.runs[segment], run) * length + within
+        exists = exists & (k < segments.parts[segment])
     at = stored(segments.ends[..., segment])
     first, length = stored(_forward(at))
     total = length[0] + length[1]
@@ -290,6 +313,48 @@ def cut(
     inside = jnp.all((pixel >= 0) & (pixel < size), axis=0)
     pixel, range_ = stored_together((pixel, range_))
     return Pieces(segment, pixel, range_, exists & inside & (range_[0] < range_[1]))
+
+
+def _set_bit(bits: UInt32[Array, " n"], number: Int[Array, " n"]) -> Int[Array, " n"]:
+    """The place of one of those bits that are set, counted from 0."""
+    place = jnp.zeros_like(number)
+    for width in (16, 8, 4, 2, 1):
+        below = lax.population_count(bits & np.uint32((1 << width) - 1)).astype(number.dtype)
+        beyond = number >= below
+        number = jnp.where(beyond, number - below, number)
+        place = jnp.where(beyond, place + width, place)
+        bits = jnp.where(beyond, bits >> width, bits)
+    return place
+
+
+def _run_of(pieces: Pieces, segments: Segments) -> Int[Array, " n"]:
+    """In which run of its edge each piece lies."""
+    start, end = stored(segments.ends[..., pieces.segment])
+    turned = end < start
+    first = jnp.floor(jnp.where(turned, -start, start)).astype(jnp.int32)
+    cell = jnp.where(turned, -pieces.pixel - 1, pieces.pixel) - first
+    length = jnp.maximum(segments.run_length[pieces.segment], 1)
+    return divided(jnp.maximum(cell[0] + cell[1], 0), length)[0]
+
+
+def with_runs(
+    runs: UInt32[Array, " edges"],
+    last: Int[Array, ""],
+    pieces: Pieces,
+    segments: Segments,
+    edge: Int[Array, " segments"],
+) -> tuple[UInt32[Array, " edges"], Int[Array, ""]]:
+    """Set the bits of the runs in which pieces lie.
+
+    Pieces of a run follow each other, and those that exist come first: the first of them sets the
+    bit. `last` is what is returned with the runs for the pieces before these, or -1.
+    """
+    run = _run_of(pieces, segments)
+    key = stored(RUNS * pieces.segment + run)
+    is_first = pieces.exists & (key != jnp.concatenate([last[None], key[:-1]]))
+    where = jnp.where(is_first, edge[pieces.segment], runs.size)
+    runs = runs.at[where].add(jnp.uint32(1) << run.astype(jnp.uint32), mode="drop")
+    return runs, jnp.max(jnp.where(pieces.exists, key, last))
 
 
 class Waiting(NamedTuple):

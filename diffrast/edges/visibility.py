@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 from diffrast._stored import stored, stored_together
 from diffrast._topology import third_corner
@@ -66,6 +66,13 @@ class Unseen(NamedTuple):
 
     farthest: Int[Array, "height width"]
     nearest: Int[Array, "height width"] | None = None  # of other bodies than those seen there
+
+
+class Survey(NamedTuple):
+    """What a first pass over all edges finds."""
+
+    runs: UInt32[Array, " edges"]  # bits of the runs of pieces that may be seen
+    unseen: Unseen
 
 
 class Side(NamedTuple):
