@@ -151,7 +151,8 @@ def _added(
         def step(n: Array, total: Array) -> Array:
             parts = parts_of(points.chosen, n, count)
             colors = _colors(shade, size, colored, points, parts, n)
-            weight = jnp.where(parts.points > 0, 1 / 16, 1 / 4)
+            quarter = jnp.array(0.25, colors[0].dtype)
+            weight = jnp.where(parts.points > 0, quarter * quarter, quarter)
             return total.at[parts.place].add(stored(_sums(colors, points, parts, n, weight)))
 
         start = _nothing(colored, points) + varying_zero((colored, points))
