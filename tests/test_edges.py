@@ -19,16 +19,15 @@ from diffrast.edges.neighborhood import Surface, walk
 from diffrast.edges.pieces import (
     AtOnce,
     Pieces,
-    Waiting,
     clip_edges,
     cut,
     facing,
-    first_ones,
     to_pixels,
     usual_batches,
     with_runs,
 )
 from diffrast.edges.rim import _border
+from diffrast.edges.waiting import Waiting, first_ones
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -47,6 +46,24 @@ def seen():
 
 def camera(eye=(0.3, 2.0, 3.0)):
     return dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=0.9, near=0.1, far=30.0)
+
+
+def view_of(mesh, camera, colors, apart=False):
+    """A view of 20 × 24 pixels with a colour for each face, and at last for the background."""
+    clip = dr.world_to_clip(camera, mesh.vertices)
+    face = dr.rasterize(clip, mesh.faces, height=20, width=24, border=1).face
+    view = View(
+        positions_clip=clip,
+        faces=mesh.faces,
+        turned=None,
+        topology=mesh.topology,
+        apart=jnp.full_like(mesh.topology.edges.seam, apart),
+        face_image=face,
+        image=colors[face],
+        background=colors[-1],
+        scene=None,
+    )
+    return with_depth(view)
 
 
 def image_of(objects, sun, view, size, **options):
@@ -326,6 +343,27 @@ def test_a_face_without_area_does_not_double_the_outline():
     np.testing.assert_allclose(other, image, atol=1e-4)
 
 
+def clipped_edges(clip, size):
+    """Vertices of loose triangles in pixels, which way these face, and their clipped edges."""
+    faces = jnp.arange(len(clip)).reshape(-1, 3)
+    pixels = to_pixels(clip, size, size)
+    volume = facing(pixels, faces)
+    edges = traced_topology(clip, faces).edges
+    number = jnp.arange(faces.size)
+    segments = clip_edges(
+        number,
+        number >= 0,
+        edges,
+        faces,
+        pixels,
+        clip[:, 2],
+        volume,
+        height=size,
+        width=size,
+    )
+    return pixels, volume, segments
+
+
 @pytest.mark.parametrize("distance", [1e-2, 1e-4, 1e-6, 1e-9])
 def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance):
     """Which way they face, and where their edges end in the picture."""
@@ -334,26 +372,12 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
     points[:, 2] *= distance
     clip = np.concatenate([points, points[..., 2:]], axis=2).reshape(-1, 4)
     clip[:, 2] -= 2 * near
-    faces = jnp.arange(300).reshape(-1, 3)
-    pixels = to_pixels(jnp.asarray(clip, jnp.float32), size, size)
-    z = jnp.asarray(clip[:, 2], jnp.float32)
-    exact = np.asarray(jnp.stack([*pixels, z]), np.float64)
-    volume = facing(pixels, faces)
-    truth = np.linalg.det(exact[:3].T[np.asarray(faces)])
+    clip = jnp.asarray(clip, jnp.float32)
+    pixels, volume, found = clipped_edges(clip, size)
+    exact = np.asarray(jnp.stack([*pixels, clip[:, 2]]), np.float64)
+    truth = np.linalg.det(exact[:3].T.reshape(-1, 3, 3))
     np.testing.assert_allclose(volume, truth, rtol=1e-3)
 
-    edges = traced_topology(jnp.asarray(clip, jnp.float32), faces).edges
-    found = clip_edges(
-        jnp.arange(300),
-        jnp.ones(300, bool),
-        edges,
-        faces,
-        pixels,
-        z,
-        volume,
-        height=size,
-        width=size,
-    )
     start, end = exact[:, np.asarray(found.vertices)].swapaxes(0, 1)
     x, y, w, z = start
     dx, dy, dw, dz = end - start
@@ -377,21 +401,9 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))
     mesh = dr.mesh.merge([MESH, turned])
-    clip = dr.world_to_clip(camera(), mesh.vertices)
-    face = dr.rasterize(clip, mesh.faces, height=20, width=24, border=1).face
     color = jnp.asarray(np.random.default_rng(3).uniform(size=(len(mesh.faces) + 1, 3)))
-    view = View(
-        positions_clip=clip,
-        faces=mesh.faces,
-        turned=None,
-        topology=mesh.topology,
-        apart=jnp.ones_like(mesh.topology.edges.seam),
-        face_image=face,
-        image=color[face].astype(jnp.float32),
-        background=color[-1].astype(jnp.float32),
-        scene=None,
-    )
-    view = with_depth(view)
+    view = view_of(mesh, camera(), color.astype(jnp.float32), apart=True)
+    clip, face = view.positions_clip, view.face_image
 
     @functools.partial(jax.jit, static_argnums=0)
     def results(capacity):
@@ -605,24 +617,9 @@ def cut_edges(size, number):
     """The edges of random triangles, and all pieces of a picture that they are cut into."""
     points = np.random.default_rng(4).uniform((-2, -2, 1), (2, 2, 3), size=(number, 3, 3))
     points[1::2] = points[1::2, :1] + 0.1 * (points[1::2] - points[1::2, :1])  # small ones
-    clip = jnp.asarray(
-        np.concatenate([points, points[..., 2:]], axis=2).reshape(-1, 4), jnp.float32
-    )
-    faces = jnp.arange(3 * number).reshape(-1, 3)
-    pixels = to_pixels(clip, size, size)
-    edges = traced_topology(clip, faces).edges
-    numbers = jnp.arange(3 * number)
-    segments = clip_edges(
-        numbers,
-        numbers >= 0,
-        edges,
-        faces,
-        pixels,
-        clip[:, 2] - 1,
-        facing(pixels, faces),
-        height=size,
-        width=size,
-    )
+    clip = np.concatenate([points, points[..., 2:]], axis=2).reshape(-1, 4)
+    clip[:, 2] -= 1
+    _, _, segments = clipped_edges(jnp.asarray(clip, jnp.float32), size)
 
     def pieces_of(segments):
         ends = prefix_sum(segments.places)
@@ -671,21 +668,6 @@ def test_edges_behind_a_face_are_not_cut_again():
     ball = dr.shapes.icosphere(2)
     wall = dr.Mesh(vertices=[[-9, -9, 1.5], [9, -9, 1.5], [0, 9, 1.5]], faces=[[0, 1, 2]])
     mesh = dr.mesh.merge([dr.Mesh(vertices=ball.vertices, faces=ball.faces), wall])
-    view = camera(eye=(0.0, 0.0, 3.0))
-    clip = dr.world_to_clip(view, mesh.vertices)
-    face = dr.rasterize(clip, mesh.faces, height=20, width=24, border=1).face
-    assert int(face.min()) >= len(ball.faces)
-    edges = with_depth(
-        View(
-            positions_clip=clip,
-            faces=mesh.faces,
-            turned=None,
-            topology=mesh.topology,
-            apart=jnp.zeros_like(mesh.topology.edges.seam),
-            face_image=face,
-            image=jnp.zeros((22, 26, 3)),
-            background=jnp.zeros(3),
-            scene=None,
-        )
-    )
+    edges = view_of(mesh, camera(eye=(0.0, 0.0, 3.0)), jnp.zeros((len(mesh.faces) + 1, 3)))
+    assert int(edges.face_image.min()) >= len(ball.faces)
     assert not np.any(survey(edges, Method(None, None, False, 0)).runs)

@@ -51,6 +51,7 @@ ORDER = [
     "diffrast.raster",
     "diffrast.edges.planes",
     "diffrast.edges.pieces",
+    "diffrast.edges.waiting",
     "diffrast.edges.parts",
     "diffrast.edges.neighborhood",
     "diffrast.edges.rim",

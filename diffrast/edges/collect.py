@@ -27,15 +27,9 @@ from diffrast.edges.blend import (
 from diffrast.edges.neighborhood import Surface, near_background
 from diffrast.edges.pieces import (
     Segments,
-    Waiting,
-    behind,
     choose_edges,
     clip_edges,
     cut,
-    first_ones,
-    gathered,
-    instead_of_first,
-    none_waiting,
     to_pixels,
     usual_batches,
     with_runs,
@@ -55,6 +49,15 @@ from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
 from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
 from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
 from diffrast.edges.visibility import Survey, Unseen, look, uncovered, unpictured
+from diffrast.edges.waiting import (
+    Waiting,
+    all_of,
+    behind,
+    first_ones,
+    gathered,
+    instead_of_first,
+    none_waiting,
+)
 
 Nearest = tuple[Float[Array, " pixels"], Int[Array, " pixels"]]  # 1/w of faces, and which
 Found = tuple[Any, ...]  # bits of edges' runs, and one or two of these
@@ -123,8 +126,7 @@ def survey(view: View, method: Method) -> Survey:
         def add_pieces(state: tuple[Array, Waiting, Array, Found]) -> Any:
             n, waiting, last, (runs, far, *near) = state
             n, waiting = edges.until_enough(segments, ends, cuts, n, waiting)
-            number = jnp.arange(waiting.pieces.exists.size, dtype=jnp.int32)
-            pieces = waiting.pieces._replace(exists=number < waiting.total)
+            pieces = all_of(waiting)
             runs, last = with_runs(runs, last, pieces, segments, edge)
             face, depth = stored_together(
                 unpictured(pieces, segments, surface.volume, view.face_image)
@@ -147,9 +149,9 @@ def survey(view: View, method: Method) -> Survey:
 
     size = edges.height, edges.width
     nowhere = jnp.full(edges.height * edges.width, -1, view.face_image.dtype) + (edges.count & 0)
-    nothing = nowhere.astype(view.positions_clip.dtype) - jnp.inf, nowhere
+    none = nowhere.astype(view.positions_clip.dtype) - jnp.inf, nowhere
     no_runs = jnp.zeros(view.apart.size, jnp.uint32) + (edges.count & 0).astype(jnp.uint32)
-    start: Found = (no_runs, *[nothing] * (1 if bodies is None else 2))
+    start: Found = (no_runs, *[none] * (1 if bodies is None else 2))
     runs, *found = over_batches(edges.order, edges.count, edges.at_once.edges, add_edges, start)
     # Held by all that follows: numbers of few faces take two bytes.
     few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
