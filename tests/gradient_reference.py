@@ -46,7 +46,6 @@ LIGHT_GROUPS_OF = {
     "point": ["light position"],
     "spot": list(LIGHT_GROUPS),
 }
-STEP = 0.05  # pixels
 SEED = 20240611
 
 
@@ -247,13 +246,13 @@ def step_sizes(problem) -> np.ndarray:
     return np.array([tiny / moved if moved else 0.0 for moved in pixels])
 
 
-def reference_jacobian(problem, lines=None, step=STEP) -> np.ndarray:
+def reference_jacobian(problem, lines=None, step=None) -> np.ndarray:
     """Return the derivatives (P, H, W, 3) of the image at rest.
 
     Central differences D over `step` pixels and twice as many give 2 D(step) - D(2 step): a pixel
     that an outline enters bends the image, and adds an error in proportion to the step.
     """
-    lines = lines or problem.lines
+    lines, step = lines or problem.lines, step or problem.step
     levelness = _levelness(reference_image(problem, lines=lines))
 
     def difference(change) -> np.ndarray:
@@ -338,7 +337,7 @@ def check(problem) -> None:
     base, steps = stored(), step_sizes(problem)
     others = {
         "twice the lines": stored(lines=2 * problem.lines),
-        "half the step": stored(step=STEP / 2),
+        "half the step": stored(step=problem.step / 2),
     }
     for (what, other), (group, part), key in product(others.items(), groups(problem).items(), base):
         change = other[key] - base[key]

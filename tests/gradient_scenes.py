@@ -28,7 +28,8 @@ class Problem:
 
     Shadows of object 0 on the plane of the last object are what steps of the first light that
     casts any are measured by. `piercing` tells that faces intersect; `nodes` is the order of
-    `render_box`'s integration, and `lines` how many of its lines a pixel has for derivatives.
+    `render_box`'s integration, `lines` how many of its lines a pixel has for derivatives, and
+    `step` how many pixels these are differences over.
     """
 
     objects: list[Object]
@@ -46,6 +47,7 @@ class Problem:
     piercing: bool = False
     nodes: int = 3
     lines: int = 64
+    step: float = 0.05
     size: int = 96
 
 
@@ -166,13 +168,16 @@ def hills() -> Problem:
 
 
 def shards() -> Problem:
-    """Triangles that pierce one another."""
+    """Triangles that pierce one another.
+
+    Where they pierce each other edges begin and end at small angles, which needs short steps.
+    """
     generator = np.random.default_rng(2)
     corners = generator.uniform(-0.8, 0.8, (100, 1, 3)) + generator.normal(0, 0.3, (100, 3, 3))
     mesh = dr.Mesh(vertices=corners.reshape(-1, 3), faces=np.arange(300).reshape(-1, 3))
     heap = _object(dr.mesh.flat_shaded(mesh), WARM, 1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     eye, target = (0.4, 0.9, 5.0), (0.0, 0.0, 0.0)
-    return Problem([heap], eye=eye, target=target, fov_y=0.6, piercing=True, cull_backfaces=False)
+    return Problem([heap], eye, target, fov_y=0.6, piercing=True, lines=256, step=0.0125)
 
 
 def crease() -> Problem:

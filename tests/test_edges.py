@@ -295,6 +295,40 @@ def test_where_one_surface_ends_another_may_lie_beyond(eye, error):
     assert np.sqrt(np.mean((image - exact) ** 2)) < error
 
 
+def test_needles_that_pierce_a_wall_end_where_they_go_into_it():
+    """A triangle that stands alone, of which a strip is seen between its edge and the wall."""
+    size, pixel = 32, 2 / 32
+    red, blue = np.array((0.9, 0.2, 0.1)), np.array((0.1, 0.3, 0.9))
+    wall = dr.Object(dr.shapes.plane(9.0, 9.0), dr.Material(diffuse=blue))
+    view = dr.Camera.orthographic(height=2.0, eye=(0, 0, 5), target=(0, 0, 0), near=0.1, far=9.0)
+    settings = dr.RenderSettings(height=size, width=size, shading="unlit")
+
+    @functools.partial(jax.jit, static_argnames="settings")
+    def drawn(tip, way, settings):
+        needle = dr.Mesh(vertices=jnp.stack([*ends, tip]) + pixel * way, faces=[[0, 1, 2]])
+        objects = [wall, dr.Object(needle, dr.Material(diffuse=red))]
+        return dr.render(dr.Scene(objects=objects), view, settings)
+
+    @jax.jit
+    def change(tip, way):
+        return jax.jvp(lambda way: drawn(tip, way, settings), (still,), (way,))[1]
+
+    ends, still = jnp.array([[-0.03, -0.8, 0.4], [0.05, 0.8, 0.4]]), jnp.zeros(3)
+    for width in (0.03, 0.1, 0.3):
+        tip, area = jnp.array([0.01 + width * pixel / 0.4, 0, -0.6]), 1.28 * width / pixel
+        image = drawn(tip, still, settings)
+        many = drawn(tip, still, dataclasses.replace(settings, antialias=False, samples=1024))
+        np.testing.assert_allclose(image, many, atol=0.01)
+        np.testing.assert_allclose((image - blue).sum(axis=(0, 1)), area * (red - blue), rtol=0.01)
+        # To the side, up, and nearer: then more of it comes out of the wall.
+        across, up, nearer = (change(tip, way) for way in jnp.eye(3))
+        moment = np.einsum("hwc,h->c", up, -np.arange(size))
+        np.testing.assert_allclose(moment, area * (red - blue), rtol=0.01)
+        for part, gained in ((across, 0), (up, 0), (nearer, 2.4 * width)):
+            total = part.sum(axis=(0, 1))
+            np.testing.assert_allclose(total, gained * (red - blue), rtol=0.01, atol=0.005)
+
+
 def test_part_of_a_body_that_no_centre_shows_may_lie_behind_another_one():
     """Where the outline of a ring leads from one row of its faces to the next."""
     sun = dr.DirectionalLight(direction=(-1, -0.5, -2), ambient=(0.2,) * 3)

@@ -5,6 +5,7 @@ a batch is under `jax.jit`, which traces it once.
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -155,7 +156,27 @@ def survey(view: View, method: Method) -> Survey:
     runs, *found = over_batches(edges.order, edges.count, edges.at_once.edges, add_edges, start)
     # Held by all that follows: numbers of few faces take two bytes.
     few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
-    return Survey(runs, Unseen(*(stored(face.astype(few)).reshape(size) for _, face in found)))
+    unseen = [face.reshape(size) for _, face in found]
+    if bodies is not None:
+        unseen[1] = _or_next_to(found[1][0].reshape(size), unseen[1])
+    return Survey(runs, Unseen(*(stored(face.astype(few)) for face in unseen)))
+
+
+def _or_next_to(depth: Array, face: Array) -> Array:
+    """The faces of pixels, and where there is none the nearest of the 3×3 round the pixel."""
+
+    def nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+        is_one = one[0] >= other[0]
+        return jnp.where(is_one, one[0], other[0]), jnp.where(is_one, one[1], other[1])
+
+    height, width = face.shape
+    best = jnp.pad(depth, 1, constant_values=-jnp.inf), jnp.pad(face, 1, constant_values=-1)
+    best = reduce(nearer, [(best[0][k : k + height], best[1][k : k + height]) for k in range(3)])
+    best = stored_together(best)
+    _, next_to = reduce(
+        nearer, [(best[0][:, k : k + width], best[1][:, k : k + width]) for k in range(3)]
+    )
+    return jnp.where(face >= 0, face, next_to)
 
 
 def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Array) -> Nearest:

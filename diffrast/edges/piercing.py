@@ -4,10 +4,10 @@ The 1/w of a plane is linear on the screen, and so is the difference of that of 
 is zero they meet, along a straight line, with the one in front on this side and the other on that.
 The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
 faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, one that has an
-edge in the pixel, but is seen at none of these centres, and the faces of two bodies that meet
+edge in the pixel or next to it, but is seen at none of these centres, and the faces of two bodies that meet
 nearest to the centre, with those next to them. These two are found by walks over both surfaces
-to where the planes meet that are known so far. Faces smaller than a pixel are too many to be cut
-with one another: the planes of these two stand for their surfaces in all of the pixel. A surface
+to where the planes meet that are known so far. Faces of a mesh that are smaller than a pixel
+are too many to be cut with one another: the planes of these two stand for their surfaces in all of the pixel. A surface
 that pierces itself is not found.
 
 With homogeneous corners V, a point p of the screen (x, y, 1) is the sum of λ V, the λ linear in p
@@ -43,7 +43,7 @@ from diffrast.edges.planes import TOLERANCE, Table, area, corners_of
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 128
 _REACH = 0.75  # pixels from the centre: farther than the corners
-_THROUGH = 0.01  # pixels to both sides of the line that both faces reach
+_THROUGH = 0.001  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
 _FINE = 2.0  # square pixels: faces of half this area count as small ones
 _WALKS = 4  # one after the other
@@ -193,7 +193,10 @@ def _candidates(
     total = _added(lambdas[0])
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
-    face, lambdas, fine = stored_together((face, lambdas * unit, size < _FINE))
+    # Of triangles that stand alone there are not too many: nor has one a surface beside it.
+    joined_to = stored(topology.neighbors[jnp.maximum(face, 0)])
+    in_mesh = (joined_to[..., 0] >= 0) | (joined_to[..., 1] >= 0) | (joined_to[..., 2] >= 0)
+    face, lambdas, fine = stored_together((face, lambdas * unit, in_mesh & (size < _FINE)))
     return _Planes(face, body, look, lambdas, known, fine), unit, met
 
 
