@@ -13,7 +13,7 @@ from diffrast._selection import prefix_sum
 from diffrast._topology import topology_of, traced_topology
 from diffrast.edges.antialias import with_depth
 from diffrast.edges.blend import Method, View
-from diffrast.edges.collect import collect, survey
+from diffrast.edges.collect import collect
 from diffrast.edges.derivative import apply_linear
 from diffrast.edges.neighborhood import Surface, walk
 from diffrast.edges.pieces import (
@@ -27,6 +27,7 @@ from diffrast.edges.pieces import (
     with_runs,
 )
 from diffrast.edges.rim import _border
+from diffrast.edges.survey import survey
 from diffrast.edges.waiting import Waiting, first_ones
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -431,7 +432,7 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
     sizes = AtOnce(edges=64, cut=1024, pieces=512, few=32, parts=16)
-    monkeypatch.setattr("diffrast.edges.collect.usual_batches", lambda *_: sizes)
+    monkeypatch.setattr("diffrast.edges.survey.usual_batches", lambda *_: sizes)
     monkeypatch.setattr("diffrast.edges.collect.PIXELS_AT_ONCE", 16)
     turned = dr.mesh.transform(MESH, dr.linalg.rotation((1.0, 0.2, 0.0), 1.2))
     mesh = dr.mesh.merge([MESH, turned])

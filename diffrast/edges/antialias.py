@@ -16,10 +16,11 @@ from diffrast._linear import without_known_zeros
 from diffrast._stored import stored
 from diffrast._topology import Topology, traced_topology
 from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
-from diffrast.edges.collect import collect, survey
+from diffrast.edges.collect import collect
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
+from diffrast.edges.survey import survey
 
 CREASES = ("none", "seams", "all")
 

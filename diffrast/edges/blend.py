@@ -27,7 +27,8 @@ from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, light_told
-from diffrast.edges.visibility import BACKGROUND, Seen, Survey
+from diffrast.edges.unseen import Survey
+from diffrast.edges.visibility import BACKGROUND, Seen
 
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 _SHALLOW = 1e-3  # pixels: keeps ratios of depths finite

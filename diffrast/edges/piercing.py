@@ -4,11 +4,11 @@ The 1/w of a plane is linear on the screen, and so is the difference of that of 
 is zero they meet, along a straight line, with the one in front on this side and the other on that.
 The line is cut to one pixel and to both faces, and then parts areas as an edge of a mesh does. Only
 faces of different bodies are looked at: those seen at the 3×3 pixels round a pixel, one that has an
-edge in the pixel or next to it, but is seen at none of these centres, and the faces of two bodies that meet
-nearest to the centre, with those next to them. These two are found by walks over both surfaces
-to where the planes meet that are known so far. Faces of a mesh that are smaller than a pixel
-are too many to be cut with one another: the planes of these two stand for their surfaces in all of the pixel. A surface
-that pierces itself is not found.
+edge in the pixel or next to it, but is seen at none of these centres, and the faces of two bodies
+that meet nearest to the centre, with those next to them. These two are found by walks over both
+surfaces to where the planes meet that are known so far. Faces of a mesh that are smaller than a
+pixel are too many to be cut with one another: the planes of these two stand for their surfaces in
+all of the pixel. A surface that pierces itself is not found.
 
 With homogeneous corners V, a point p of the screen (x, y, 1) is the sum of λ V, the λ linear in p
 and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, and c · V = 1 at each
@@ -63,7 +63,7 @@ class _Planes(NamedTuple):
     look: Array  # 0 to 8: pixel of the 3×3 whose colour changes as this face's
     lambdas: Array  # (3, 3 corners, 18, n): at the centre in units of the largest sum, slopes
     known: Array  # neither edge-on nor there already
-    fine: Array  # smaller than a pixel
+    fine: Array  # of a mesh, and smaller than a pixel
 
 
 # Walks done; two faces; whether they are looked for, each arrived, and they meet; and where.
@@ -193,7 +193,7 @@ def _candidates(
     total = _added(lambdas[0])
     largest = jnp.max(jnp.where(known, abs(total), 0), axis=0)
     unit = stored(1 / jnp.where(largest > 0, largest, 1))
-    # Of triangles that stand alone there are not too many: nor has one a surface beside it.
+    # A triangle that stands alone is all there is of its surface.
     joined_to = stored(topology.neighbors[jnp.maximum(face, 0)])
     in_mesh = (joined_to[..., 0] >= 0) | (joined_to[..., 1] >= 0) | (joined_to[..., 2] >= 0)
     face, lambdas, fine = stored_together((face, lambdas * unit, in_mesh & (size < _FINE)))

@@ -14,6 +14,8 @@ from diffrast._stored import stored, stored_together
 
 TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
+_BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
+_ROUNDINGS = 8  # of a position, if that is more
 
 Columns = list[Float[Array, "*n"]]
 Table = Float[Array, "3 V"]  # vertices in homogeneous pixel coordinates x, y, w
@@ -129,3 +131,12 @@ def area(corners: Array) -> Array:
     x, y = corners[:2] / jnp.where(before, corners[2], 1)
     twice = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     return jnp.where(before, abs(twice), jnp.inf)
+
+
+def beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:
+    """Pixels from edges to the points that show what hides them, inside, and what is beyond.
+
+    As few as rounding leaves certain: where fine surfaces fold, others lie as near.
+    """
+    outside = max(_BEYOND, _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape))
+    return 2 * outside, outside

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored, stored_together
 from diffrast._topology import third_corner
@@ -40,16 +40,15 @@ from diffrast.edges.planes import (
     Columns,
     Table,
     area,
+    beside_edge,
     corners_of,
-    covers,
     edge_values,
     inverse_depth_slope,
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
+from diffrast.edges.unseen import Unseen
 from diffrast.edges.ways import LOOK, Spot, inwards, outwards, sides_of, walked
 
-_BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
-_ROUNDINGS = 8  # of a position, if that is more
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
@@ -59,20 +58,6 @@ _FARTHEST = 9 + 12  # which of the candidates, behind those at nine pixels, is t
 # Which of them are next to an edge's first face, or second.
 _NEXT = np.zeros((2, _FARTHEST + 2, 1), bool)
 _NEXT[0, [9, 11]] = _NEXT[1, [10, 12]] = True
-
-
-class Unseen(NamedTuple):
-    """Faces that have an edge in a pixel, but are seen at no centre of the 3×3 round it; or -1."""
-
-    farthest: Int[Array, "height width"]
-    nearest: Int[Array, "height width"] | None = None  # of other bodies than those seen there
-
-
-class Survey(NamedTuple):
-    """What a first pass over all edges finds."""
-
-    runs: UInt32[Array, " edges"]  # bits of the runs of pieces that may be seen
-    unseen: Unseen
 
 
 class Side(NamedTuple):
@@ -98,69 +83,6 @@ class Seen(NamedTuple):
     begin: Float[Array, "2 n"]  # ends of the part, from the pixel's centre
     end: Float[Array, "2 n"]
     middle: Float[Array, " n"]  # of the part on the clipped edge, as seen on the screen
-
-
-@jax.jit
-def uncovered(
-    pieces: Pieces,
-    segments: Segments,
-    surface: Surface,
-    face_image: Int[Array, "height_with_border width_with_border"],
-) -> Pieces:
-    """Pieces without those that the face seen at their pixel's centre hides all along.
-
-    Most are left out where many surfaces lie one behind the other.
-    """
-    column, row = pieces.pixel
-    face = stored(face_image[row + 1, column + 1])
-    own, weights, ends = stored_together(
-        (
-            segments.faces[:, pieces.segment],
-            segments.weights[:, pieces.segment],
-            segments.ends[..., pieces.segment],
-        )
-    )
-    along = ends[1] - ends[0]
-    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    inside, _ = _beside_edge(face_image.shape, length.dtype)
-    aside = along * (inside / jnp.where(length > 0, length, 1))
-    sides = jnp.stack([-aside, aside])
-    x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)
-    y = ends[0, 1] + pieces.range * along[1] - sides[:, None, 0]
-    x, y = stored_together((x, y))
-    corners = corners_of(face, surface.faces, surface.pixels)[:, :, None, None]
-    values, depth = edge_values(corners, x, y, near=(x[0, 0], y[0, 0]))
-    own_depth = weights[0] + pieces.range * (weights[1] - weights[0])
-    before = covers(values) & (depth > own_depth * (1 + FINE_TOLERANCE))
-    before = stored(before.astype(jnp.int32)).reshape(4, -1)  # a reduction would be no vector code
-    foreign = (face >= 0) & (face != own[0]) & (face != own[1])
-    hidden = foreign & ((before[0] & before[1] & before[2] & before[3]) > 0)
-    return pieces._replace(exists=pieces.exists & ~hidden)
-
-
-@jax.jit
-def unpictured(
-    pieces: Pieces,
-    segments: Segments,
-    volume: Float[Array, " F"],
-    face_image: Int[Array, "height_with_border width_with_border"],
-) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """Faces of pieces' edges that none of the 3×3 pixels shows, or -1; and 1/w of the pieces.
-
-    Not one that turns away beside one that shows its front: of a closed body it cannot be seen.
-    """
-    own, weights = stored_together(
-        (segments.faces[:, pieces.segment], segments.weights[:, pieces.segment])
-    )
-    pictured = pixels_round(face_image, *pieces.pixel)
-    drawn = own >= 0
-    away = drawn & (volume[jnp.maximum(own, 0)] >= 0)
-    closed_in = away & (drawn & ~away)[::-1]
-    shown = jnp.any(pictured[:, None] == own, axis=0)
-    first, second = jnp.where(drawn & ~closed_in & ~shown & pieces.exists, own, -1)
-    face = jnp.maximum(first, second)
-    middle = (pieces.range[0] + pieces.range[1]) / 2
-    return face, weights[0] + middle * (weights[1] - weights[0])
 
 
 @jax.jit
@@ -222,7 +144,7 @@ def look(
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
-    inside, outside = _beside_edge(face_image.shape, length.dtype)
+    inside, outside = beside_edge(face_image.shape, length.dtype)
     offset = jnp.stack([-jnp.minimum(inside, thickness / 2) * out, outside * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     x, y = stored_together((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
@@ -392,15 +314,6 @@ def look(
         middle=t,
     )
     return stored_together(seen), left
-
-
-def _beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:
-    """Pixels from edges to the points that show what hides them, inside, and what is beyond.
-
-    As few as rounding leaves certain: where fine surfaces fold, others lie as near.
-    """
-    outside = max(_BEYOND, _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape))
-    return 2 * outside, outside
 
 
 def _where_shown(face: Array, look: Array, patch: Array, patches: Array) -> Array:
