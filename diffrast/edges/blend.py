@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float, Int
 from diffrast._device import draws_on_cpu
 from diffrast._stored import stepped, stored, stored_together, zero_after
 from diffrast._topology import Topology, by_three
-from diffrast.edges.pieces import Pieces, Segments
+from diffrast.edges.neighborhood import picked
+from diffrast.edges.pieces import Pieces, Segments, to_pixels
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
@@ -120,6 +121,44 @@ def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
     total = jnp.sum(vertex, axis=1)
     moment = jnp.sum(vertex * (across * x + down * y), axis=1)
     return jnp.stack([total * across, total * down, -moment], axis=1).reshape(6, -1)
+
+
+def _opening(
+    view: View, segments: Segments, pieces: Pieces, seen: Seen
+) -> tuple[Int[Array, "2 n"], Float[Array, "6 n"]]:
+    """How the inner edge of the face at a rim moves: the area between here and there.
+
+    Returns:
+        The two vertices of this edge, and the derivative of the area by their x, y, w.
+    """
+    vertices = stored(jnp.stack([*segments.vertices[:, pieces.segment], seen.rim.apex]))
+    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    table = to_pixels(view.positions_clip[vertices.reshape(-1)], height, width)
+    x, y, w = stored(table).reshape(3, 3, -1)
+    inverse_w = 1 / jnp.where(w > 0, w, 1)
+    centre = pieces.pixel.astype(w.dtype) + 0.5
+    middle = centre + (seen.begin + seen.end) / 2
+    right, down = x * inverse_w - middle[0], y * inverse_w - middle[1]
+    across = seen.end - seen.begin
+    length = jnp.hypot(*across)
+    along = across / jnp.where(length > 0, length, 1)
+    inward = jnp.where(seen.front_on_right, 1, -1) * jnp.stack([along[1], -along[0]])
+    ahead = along[0] * right + along[1] * down
+    depth = inward[0] * right + inward[1] * down
+    # It leads to the apex from the end of the rim that is on the other side of the middle.
+    end = jnp.where(ahead[2] < 0, 1, 0)
+    span = ahead[2] - picked(ahead, end)
+    inverse_span = jnp.where(span != 0, 1, 0) / jnp.where(span != 0, span, 1)
+    share = jnp.clip(-picked(ahead, end) * inverse_span, 0, 1)
+    steep = jnp.clip((depth[2] - picked(depth, end)) * inverse_span, -1, 1)
+    way = length * (inward - steep * along)
+    rows = []
+    for part, vertex in ((1 - share, end), (share, jnp.full_like(end, 2))):
+        weight = part * picked(inverse_w, vertex)
+        place = middle[0] + picked(right, vertex), middle[1] + picked(down, vertex)
+        rows += [*(weight * way), -weight * (way[0] * place[0] + way[1] * place[1])]
+    motion = jnp.where(jnp.all(w > 0, axis=0), jnp.stack(rows), 0)
+    return jnp.stack([picked(vertices, end), vertices[2]]), motion
 
 
 def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
@@ -223,7 +262,10 @@ def with_pieces(
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
-        jump = behind - jnp.where(smooth, moved, front)
+        # What is inwards of a thin face moves with its inner edge.
+        thin = smooth & rim.thin
+        opening = jnp.where(thin, (front + bend) / 2 - moved, 0)
+        jump = behind - jnp.where(smooth, moved + opening, front)
         turn = length * (integral - _mean(rim.reaches) * near)
         own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
@@ -248,7 +290,13 @@ def with_pieces(
         jnp.stack([area, rim_length], axis=-1),
         stored(outward * _motion(segments, pieces, found)).T,
     )
-    return Blended(with_rows(total.records, used, rows), sums)
+    records = with_rows(total.records, used, rows)
+    if records is not None and method.shader is not None:
+        vertices, motion = _opening(view, segments, pieces, found)
+        integers = jnp.stack([pixel, *places, *vertices], axis=-1)
+        rows = integers, stored(opening).T, jnp.zeros_like(rows[2]), stored(motion).T
+        records = with_rows(records, used & thin, rows)
+    return Blended(records, sums)
 
 
 def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended:

@@ -12,6 +12,8 @@ from diffrast.edges.planes import Columns, barycentrics, corners_of, edge_values
 
 BESIDE = 0.02  # pixels
 _SMALL = 1e-6  # keeps a ratio of lengths finite
+_THIN = 0.15  # pixels
+_LONG = 4.0  # pixels: where edges are shorter, the next face takes the place of one that opens
 _EIGHTHS = (-3 / 8, -1 / 8, 1 / 8, 3 / 8)  # of a piece, from its middle
 SHORT = 1e-3  # pixels: no piece is left that is shorter
 
@@ -24,6 +26,8 @@ class Rim(NamedTuple):
     reaches: Float[Array, "4 n"]  # how far the pixel reaches, from the middles of four parts
     depth: Float[Array, " n"]  # and from that of the whole,
     first: Float[Array, " n"]  # and how far the face at the edge does, if that is less
+    thin: Bool[Array, " n"]  # whether that is hardly anything, of a long edge,
+    apex: Int[Array, " n"]  # and the vertex of that face which is not on the edge
     bend: tuple[Int[Array, " n"], Columns]  # face and barycentrics where that face ends
     far: tuple[Int[Array, " n"], Columns]  # and where the pixel ends
     single: Bool[Array, " n"]  # whether one face covers what lies between
@@ -53,11 +57,13 @@ def _reach(
 
 def look_inwards(
     front: Int[Array, " n"],
+    apex: Int[Array, " n"],
     thickness: Float[Array, " n"],
     pictured: Int[Array, "9 n"],
     inwards: tuple[Float[Array, " n"], Int[Array, " n"]],
     connected: Bool[Array, " n"],
     middle: Float[Array, "2 n"],
+    long: Float[Array, " n"],
     across: Float[Array, "2 n"],
     inward: Float[Array, "2 n"],
     centre: Float[Array, "2 n"],
@@ -67,11 +73,13 @@ def look_inwards(
 
     Args:
         front: face in front.
+        apex: its vertex that is not on the edge.
         thickness: how far it reaches.
         pictured: faces at the 3×3 pixels.
         inwards: what `next_inwards` tells.
         connected: whether the pixel that shows the front and the next one inwards show its surface.
         middle: of the piece, from the pixel's centre.
+        long: how long the edge is.
         across: from the piece's begin to its end.
         inward: unit normal towards the face in front.
         centre: of the pixel, on the screen.
@@ -102,6 +110,8 @@ def look_inwards(
         reaches=jnp.stack([_reach(middle + way * across, inward) for way in _EIGHTHS]),
         depth=depth,
         first=first,
+        thin=(thickness < jnp.minimum(depth, _THIN)) & (long > _LONG) & (next_face != front),
+        apex=apex,
         bend=(front, [b / total for b in bend]),
         far=(beyond, [b[1] for b in at]),
         single=covered[1],

@@ -38,7 +38,6 @@ from diffrast.edges.planes import (
     FINE_TOLERANCE,
     TOLERANCE,
     Columns,
-    Table,
     area,
     beside_edge,
     corners_of,
@@ -133,7 +132,8 @@ def look(
     out = stored(outward * normal)
 
     t = (pieces.range[0] + pieces.range[1]) / 2
-    thickness = stored(_thickness(front, front_corners, faces, pixels, ends[0], normal, length, t))
+    apex = stored(faces[jnp.maximum(front, 0), third_corner(front_corners)])
+    thickness = stored(_thickness(pixels[:, apex], ends[0], normal, length, t))
     pictured = stored(pixels_round(face_image, *pieces.pixel))
     undrawn = own < -1
     of_edge = jnp.where(undrawn, -2 - own, own)
@@ -279,11 +279,13 @@ def look(
 
     rim = look_inwards(
         front,
+        apex,
         thickness,
         pictured,
         (rim_depth, inner),
         walks.connected[0] & walks.connected[1],
         middle,
+        length,
         end - begin,
         -out,
         centre,
@@ -329,18 +331,9 @@ def _at(image: Int[Array, "height width"], column: Array, row: Array) -> Int[Arr
     return stored(image[row.clip(0, height - 1), column.clip(0, width - 1)].astype(jnp.int32))
 
 
-def _thickness(
-    face: Array,
-    edge: Array,
-    faces: Array,
-    pixels: Table,
-    start: Array,
-    normal: Array,
-    length: Array,
-    t: Array,
-) -> Array:
+def _thickness(apex: Array, start: Array, normal: Array, length: Array, t: Array) -> Array:
     """How far a face reaches from the point `t` of its edge, at right angles to it, or less."""
-    x, y, w = pixels[:, stored(faces[jnp.maximum(face, 0), third_corner(edge)])]
+    x, y, w = apex
     inverse_w = 1 / jnp.where(w > 0, w, 1)
     x, y = x * inverse_w - start[0], y * inverse_w - start[1]
     height = jnp.abs(x * normal[0] + y * normal[1])
