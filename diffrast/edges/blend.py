@@ -125,11 +125,12 @@ def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
 
 def _opening(
     view: View, segments: Segments, pieces: Pieces, seen: Seen
-) -> tuple[Int[Array, "2 n"], Float[Array, "6 n"]]:
+) -> tuple[Int[Array, "2 n"], Float[Array, "6 n"], Bool[Array, " n"]]:
     """How the inner edge of the face at a rim moves: the area between here and there.
 
     Returns:
-        The two vertices of this edge, and the derivative of the area by their x, y, w.
+        The two vertices of this edge, the derivative of the area by their x, y, w, and whether the
+        whole face is before the eye; else there is none.
     """
     vertices = stored(jnp.stack([*segments.vertices[:, pieces.segment], seen.rim.apex]))
     height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
@@ -157,8 +158,7 @@ def _opening(
         weight = part * picked(inverse_w, vertex)
         place = middle[0] + picked(right, vertex), middle[1] + picked(down, vertex)
         rows += [*(weight * way), -weight * (way[0] * place[0] + way[1] * place[1])]
-    motion = jnp.where(jnp.all(w > 0, axis=0), jnp.stack(rows), 0)
-    return jnp.stack([picked(vertices, end), vertices[2]]), motion
+    return jnp.stack([picked(vertices, end), vertices[2]]), jnp.stack(rows), jnp.all(w > 0, axis=0)
 
 
 def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
@@ -262,10 +262,12 @@ def with_pieces(
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
-        # What is inwards of a thin face moves with its inner edge.
-        thin = smooth & rim.thin
-        opening = jnp.where(thin, (front + bend) / 2 - moved, 0)
-        jump = behind - jnp.where(smooth, moved + opening, front)
+        jump = behind - jnp.where(smooth, moved, front)
+        if method.capacity:  # what is inwards of a thin face moves with its inner edge
+            inner_edge, inner_motion, before_eye = _opening(view, segments, pieces, found)
+            thin = smooth & rim.thin & before_eye
+            opening = stored(jnp.where(thin, (front + bend) / 2 - moved, 0))
+            jump = jump - opening
         turn = length * (integral - _mean(rim.reaches) * near)
         own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
@@ -291,10 +293,9 @@ def with_pieces(
         stored(outward * _motion(segments, pieces, found)).T,
     )
     records = with_rows(total.records, used, rows)
-    if records is not None and method.shader is not None:
-        vertices, motion = _opening(view, segments, pieces, found)
-        integers = jnp.stack([pixel, *places, *vertices], axis=-1)
-        rows = integers, stored(opening).T, jnp.zeros_like(rows[2]), stored(motion).T
+    if method.capacity and method.shader is not None:
+        integers = jnp.stack([pixel, *places, *inner_edge], axis=-1)
+        rows = integers, opening.T, jnp.zeros_like(rows[2]), stored(inner_motion).T
         records = with_rows(records, used & thin, rows)
     return Blended(records, sums)
 
