@@ -59,6 +59,7 @@ ORDER = [
     "diffrast.edges.ways",
     "diffrast.edges.unseen",
     "diffrast.edges.visibility",
+    "diffrast.edges.areas",
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_lines",
     "diffrast.edges.records",

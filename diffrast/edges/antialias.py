@@ -157,7 +157,7 @@ def with_depth(view: View) -> View:
 
     Lights and their weights follow its positions, then, if it has shadows.
     """
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    height, width = view.size
     depth = depth_of(view.positions_clip)
     scale = scale_by_depth(depth, view.positions_clip)
     if view.topology.bodies is None and view.cast is None:
@@ -195,7 +195,7 @@ def antialias_image(
     """
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
-    height, width, channels = view.image.shape[0] - 2, view.image.shape[1] - 2, view.image.shape[2]
+    (height, width), channels = view.size, view.image.shape[2]
     capacity = ROWS_AT_ONCE * max(4, height * width // (10 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 

@@ -1,13 +1,7 @@
 """Exact areas of pixels beyond edges: the anti-aliased image, and records of what made it.
 
-A piece of an edge from y0 to y1, relative to its pixel's centre, parts off the area beyond it as
-the centre sees it; there the picture shows what is on the other side. With q the position of a
-direction along the unit square's perimeter, 0 to 4,
-
-    S = wrap(q(y1) - q(y0)) / 4 - (y0 × y1) / 2,    pixel += S (colour right - colour left),
-
-which adds up exactly over the pieces of any outline. To first order dS is minus the piece's normal
-times the motion of its middle: linear in the positions, without a singularity.
+A piece of an edge parts off the area S beyond it as its pixel's centre sees it (see `areas`); there
+the picture shows what is on the other side: pixel += S (colour right - colour left).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,8 +16,8 @@ from jaxtyping import Bool, Float, Int
 from diffrast._device import draws_on_cpu
 from diffrast._stored import stepped, stored, stored_together, zero_after
 from diffrast._topology import Topology, by_three
-from diffrast.edges.neighborhood import picked
-from diffrast.edges.pieces import Pieces, Segments, to_pixels
+from diffrast.edges.areas import area_beyond, motion_of_edge, motion_of_inner_edge
+from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
@@ -56,6 +50,11 @@ class View(NamedTuple):
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
     survey: Survey | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the pictures without their border."""
+        return self.image.shape[0] - 2, self.image.shape[1] - 2
 
 
 class Method(NamedTuple):
@@ -91,76 +90,6 @@ class Blended(NamedTuple):
     sums: Sums | None
 
 
-def perimeter(x: Array, y: Array) -> Array:
-    """Where the ray through (x, y) leaves the unit square, 0 to 4 along its perimeter."""
-    across, along = jnp.abs(x), jnp.abs(y)
-    largest = jnp.maximum(across, along)
-    inverse = 0.5 / jnp.where(largest > 0, largest, 1)
-    return jnp.where(
-        across >= along,
-        jnp.where(x >= 0, 0, 2) + jnp.where(x >= 0, y, -y) * inverse,
-        jnp.where(y > 0, 1, 3) + jnp.where(y > 0, -x, x) * inverse,
-    )
-
-
-def _area(begin: Array, end: Array) -> Array:
-    """Part of the pixel beyond a piece, positive if that is on the right."""
-    turn = perimeter(*end) - perimeter(*begin)
-    turn = turn - 4 * jnp.round(turn / 4)
-    return turn / 4 - (begin[0] * end[1] - begin[1] * end[0]) / 2
-
-
-def _motion(segments: Segments, pieces: Pieces, seen: Seen) -> Array:
-    """Derivative of the area by x, y, w of the edge's start and of its end, shape (6, n)."""
-    of = pieces.segment
-    across, down = seen.begin[1] - seen.end[1], seen.end[0] - seen.begin[0]
-    shares = jnp.stack([1 - seen.middle, seen.middle]) * segments.weights[:, of]
-    inside = segments.range[:, of]
-    vertex = shares * jnp.stack([1 - inside, inside])  # (start and end, clipped ends, n)
-    x, y = segments.ends[:, 0, of], segments.ends[:, 1, of]
-    total = jnp.sum(vertex, axis=1)
-    moment = jnp.sum(vertex * (across * x + down * y), axis=1)
-    return jnp.stack([total * across, total * down, -moment], axis=1).reshape(6, -1)
-
-
-def _opening(
-    view: View, segments: Segments, pieces: Pieces, seen: Seen
-) -> tuple[Int[Array, "2 n"], Float[Array, "6 n"], Bool[Array, " n"]]:
-    """How the inner edge of the face at a rim moves: the area between here and there.
-
-    Returns:
-        The two vertices of this edge, the derivative of the area by their x, y, w, and whether the
-        whole face is before the eye; else there is none.
-    """
-    vertices = stored(jnp.stack([*segments.vertices[:, pieces.segment], seen.rim.apex]))
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    table = to_pixels(view.positions_clip[vertices.reshape(-1)], height, width)
-    x, y, w = stored(table).reshape(3, 3, -1)
-    inverse_w = 1 / jnp.where(w > 0, w, 1)
-    centre = pieces.pixel.astype(w.dtype) + 0.5
-    middle = centre + (seen.begin + seen.end) / 2
-    right, down = x * inverse_w - middle[0], y * inverse_w - middle[1]
-    across = seen.end - seen.begin
-    length = jnp.hypot(*across)
-    along = across / jnp.where(length > 0, length, 1)
-    inward = jnp.where(seen.front_on_right, 1, -1) * jnp.stack([along[1], -along[0]])
-    ahead = along[0] * right + along[1] * down
-    depth = inward[0] * right + inward[1] * down
-    # It leads to the apex from the end of the rim that is on the other side of the middle.
-    end = jnp.where(ahead[2] < 0, 1, 0)
-    span = ahead[2] - picked(ahead, end)
-    inverse_span = jnp.where(span != 0, 1, 0) / jnp.where(span != 0, span, 1)
-    share = jnp.clip(-picked(ahead, end) * inverse_span, 0, 1)
-    steep = jnp.clip((depth[2] - picked(depth, end)) * inverse_span, -1, 1)
-    way = length * (inward - steep * along)
-    rows = []
-    for part, vertex in ((1 - share, end), (share, jnp.full_like(end, 2))):
-        weight = part * picked(inverse_w, vertex)
-        place = middle[0] + picked(right, vertex), middle[1] + picked(down, vertex)
-        rows += [*(weight * way), -weight * (way[0] * place[0] + way[1] * place[1])]
-    return jnp.stack([picked(vertices, end), vertices[2]]), jnp.stack(rows), jnp.all(w > 0, axis=0)
-
-
 def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
     channels, dtype = view.image.shape[2], view.image.dtype
@@ -182,7 +111,7 @@ def _place(view: View, pixel: Array, look: Array | int) -> Array:
 
 def number_of_pixel(view: View, pixel: Array) -> Array:
     """Index of pixels in the image without its border."""
-    return pixel[1] * (view.image.shape[1] - 2) + pixel[0]
+    return pixel[1] * view.size[1] + pixel[0]
 
 
 def _colors(image: Array, place: Int[Array, " n"]) -> Float[Array, "channels n"]:
@@ -249,7 +178,7 @@ def with_pieces(
     front = near
     outward = jnp.where(found.front_on_right, -1, 1)
     across = found.end - found.begin
-    area, length = outward * _area(found.begin, found.end), jnp.hypot(*across)
+    area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
     smooth = jnp.zeros_like(found.visible)
     if method.shader is None:
@@ -264,7 +193,9 @@ def with_pieces(
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
         if method.capacity:  # what is inwards of a thin face moves with its inner edge
-            inner_edge, inner_motion, before_eye = _opening(view, segments, pieces, found)
+            inner_edge, inner_motion, before_eye = motion_of_inner_edge(
+                view.positions_clip, view.size, segments, pieces, found
+            )
             thin = smooth & rim.thin & before_eye
             opening = stored(jnp.where(thin, (front + bend) / 2 - moved, 0))
             jump = jump - opening
@@ -290,7 +221,7 @@ def with_pieces(
         jnp.stack([pixel, *places, start, end], axis=-1),
         jump.T,
         jnp.stack([area, rim_length], axis=-1),
-        stored(outward * _motion(segments, pieces, found)).T,
+        stored(outward * motion_of_edge(segments, pieces, found)).T,
     )
     records = with_rows(total.records, used, rows)
     if method.capacity and method.shader is not None:
@@ -302,7 +233,7 @@ def with_pieces(
 
 def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended:
     """Add lines where surfaces pierce each other."""
-    area = stored(_area(line.begin, line.end))
+    area = stored(area_beyond(line.begin, line.end))
     places = [_place(view, line.pixel, look) for look in line.look]
     if method.shader is None:
         right, left = stored_together([_colors(view.image, place) for place in places])
@@ -327,7 +258,7 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     """Add lines across which a light begins."""
     assert method.glow is not None
     assert view.cast is not None
-    area = stored(_area(line.begin, line.end))
+    area = stored(area_beyond(line.begin, line.end))
     colors = method.glow(view.scene, line.light, line.face, line.barycentrics)
     glow = jnp.stack(stored_together(colors))
     jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)

@@ -120,7 +120,7 @@ def _edges(
 
 def _piercing(view: View, method: Method, surface: Surface) -> Work:
     """The lines along which surfaces pierce each other."""
-    bodies, width = view.topology.bodies, view.image.shape[1] - 2
+    bodies, width = view.topology.bodies, view.size[1]
     assert bodies is not None
     assert view.survey is not None
     assert view.survey.unseen.nearest is not None
@@ -149,7 +149,7 @@ def _piercing(view: View, method: Method, surface: Surface) -> Work:
 
 def _shadows(view: View, cast: Cast, method: Method, surface: Surface) -> Work:
     """The outlines of shadows."""
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
+    height, width = view.size
     order, count = choose_shadowed(cast)
     shadows_at_once = lanes() * SHADOWS_AT_ONCE
 

@@ -129,7 +129,7 @@ def _pull(
     inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
     # What the cotangent is made of need not be held any longer, then.
     cotangent = stored(cotangent, cropped(view.image, view.image.shape))
-    own = cotangent.reshape(view.image.shape[0] - 2, view.image.shape[1] - 2, -1)
+    own = cotangent.reshape(*view.size, -1)
     own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(rim.size, -1)
 
     def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:

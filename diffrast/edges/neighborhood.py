@@ -88,6 +88,24 @@ def largest_round(values: Array) -> Array:
     return jnp.maximum(jnp.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
 
 
+def nearest_round(
+    depth: Float[Array, "height width"], face: Int[Array, "height width"]
+) -> Int[Array, "height width"]:
+    """Of the faces of 3×3 pixels each, the one with the largest `depth`, which is 1/w; or -1."""
+
+    def nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+        is_one = one[0] >= other[0]
+        return jnp.where(is_one, one[0], other[0]), jnp.where(is_one, one[1], other[1])
+
+    height, width = face.shape
+    best = jnp.pad(depth, 1, constant_values=-jnp.inf), jnp.pad(face, 1, constant_values=-1)
+    best = reduce(nearer, [(best[0][k : k + height], best[1][k : k + height]) for k in range(3)])
+    best = stored_together(best)
+    return reduce(
+        nearer, [(best[0][:, k : k + width], best[1][:, k : k + width]) for k in range(3)]
+    )[1]
+
+
 def is_near_background(
     near: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
 ) -> Bool[Array, " n"]:

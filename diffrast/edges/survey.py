@@ -1,6 +1,5 @@
 """The first pass over all edges of a mesh, which finds what may be seen beside pixels' centres."""
 
-from functools import reduce
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from diffrast._device import anywhere
 from diffrast._selection import batches_of, over_batches, prefix_sum
 from diffrast._stored import stored, stored_together
 from diffrast.edges.blend import Method, View, number_of_pixel
-from diffrast.edges.neighborhood import Surface
+from diffrast.edges.neighborhood import Surface, nearest_round
 from diffrast.edges.pieces import (
     Segments,
     choose_edges,
@@ -31,8 +30,7 @@ Found = tuple[Any, ...]  # bits of edges' runs, and one or two of these
 
 def surface_of(view: View, method: Method) -> Surface:
     """The faces whose edges are looked for, with their vertices in pixels."""
-    height, width = view.image.shape[0] - 2, view.image.shape[1] - 2
-    pixels = stored(to_pixels(view.positions_clip, height, width))
+    pixels = stored(to_pixels(view.positions_clip, *view.size))
     volume = view.volume
     assert volume is not None
     if method.cull_backfaces:
@@ -45,7 +43,7 @@ class Edges:
     """The edges of the mesh across which the picture may jump."""
 
     def __init__(self, view: View, surface: Surface, chosen: tuple[Array, Array]):
-        self.height, self.width = view.image.shape[0] - 2, view.image.shape[1] - 2
+        self.height, self.width = view.size
         self.view, self.surface = view, surface
         self.order, self.count = chosen
         self.z = stored(view.positions_clip[:, 2])
@@ -138,7 +136,8 @@ def survey(view: View, method: Method) -> Survey:
     few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
     unseen = [face.reshape(size) for _, face in found]
     if bodies is not None:
-        unseen[1] = _or_next_to(found[1][0].reshape(size), unseen[1])
+        next_to = nearest_round(found[1][0].reshape(size), unseen[1])
+        unseen[1] = jnp.where(unseen[1] >= 0, unseen[1], next_to)
     return Survey(runs, Unseen(*(stored(face.astype(few)) for face in unseen)))
 
 
@@ -149,20 +148,3 @@ def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Arra
     nearest = nearest.at[number].max(depth, mode="drop")
     number = jnp.where(depth < nearest[number], known.size, number)
     return nearest, known.at[number].set(-1, mode="drop").at[number].max(face, mode="drop")
-
-
-def _or_next_to(depth: Array, face: Array) -> Array:
-    """The faces of pixels, and where there is none the nearest of the 3×3 round the pixel."""
-
-    def nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-        is_one = one[0] >= other[0]
-        return jnp.where(is_one, one[0], other[0]), jnp.where(is_one, one[1], other[1])
-
-    height, width = face.shape
-    best = jnp.pad(depth, 1, constant_values=-jnp.inf), jnp.pad(face, 1, constant_values=-1)
-    best = reduce(nearer, [(best[0][k : k + height], best[1][k : k + height]) for k in range(3)])
-    best = stored_together(best)
-    _, next_to = reduce(
-        nearer, [(best[0][:, k : k + width], best[1][:, k : k + width]) for k in range(3)]
-    )
-    return jnp.where(face >= 0, face, next_to)

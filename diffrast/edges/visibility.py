@@ -2,12 +2,13 @@
 
 Candidates for what hides a piece, or lies behind it, are the faces at the 3×3 pixels round it,
 those round the edge itself, and of those that have an edge in the pixel but show at none of these
-centres the farthest and, of several bodies, the nearest of another one. The first part of the piece
-is looked at here (see `parts`); what is left of it becomes a piece of its own. Faces may be too
-thin for any pixel to show them: a walk over the surface that is seen nearby, and would hide the
-part if it reached it, tells whether it does. Where no candidate lies behind the part, walks over
-two surfaces at the pixels around, the one beyond first, tell which of their faces does, or that
-both end before. Where only one is seen, the second may be one that no centre shows.
+centres the farthest and, of several bodies, the nearest of another one (or that of the next pixel).
+The first part of the piece is looked at here (see `parts`); what is left of it becomes a piece of
+its own. Faces may be too thin for any pixel to show them: a walk over the surface that is seen
+nearby, and would hide the part if it reached it, tells whether it does. Where no candidate lies
+behind the part, walks over two surfaces at the pixels around, the one beyond first, tell which of
+their faces does, or that both end before. Where only one is seen, the second may be one that no
+centre shows.
 """
 
 from typing import NamedTuple
