@@ -135,6 +135,16 @@ def test_lines_beyond_the_image_show_what_is_in_it():
     assert not lit(plain(outside, [[0, 1], [2, 3], [4, 5]]))
 
 
+@pytest.mark.parametrize("size", [8192, 8193, 16384])
+def test_lines_reach_the_borders_of_the_widest_pictures(size):
+    for ends in ([[-9000.0, 1.5], [20000.0, 1.5]], [[20.0, 1.5], [-3.0, 1.5]]):
+        image = dr.draw_lines(ends, [[0, 1]], height=4, width=size, antialias=False)
+        row, column = np.ogrid[:4, :size]
+        np.testing.assert_array_equal(
+            np.any(np.asarray(image) > 0, axis=-1), (row == 1) & (column <= max(ends)[0])
+        )
+
+
 def test_the_last_line_drawn_is_on_top_and_none_is_lost():
     count = 50_000  # more than are worked off at a time, all through the same pixels
     points = np.tile([[0.5, 5.5], [23.5, 5.5]], (count, 1))

@@ -22,7 +22,8 @@ from drawing import (
 from diffrast import shapes
 from diffrast.camera import Camera, world_to_clip
 from diffrast.raster import rasterize
-from diffrast.raster.fixed_point import subpixel_bits
+from diffrast.raster.edge_functions import Edge, Image, corners_of, edge_value, set_up
+from diffrast.raster.fixed_point import snap_vertices, subpixel_bits
 
 RNG = np.random.default_rng(0)
 
@@ -162,6 +163,36 @@ def test_large_image():
 
 def test_fixed_point_fits_its_range():
     assert [subpixel_bits(1, size) for size in (1, 8192, 8194, 16384, 16386)] == [10, 10, 9, 9, 8]
+
+
+@pytest.mark.parametrize("size", [5793, 8192, 16384])
+def test_edges_of_pictures_as_wide_as_the_guard_band(size):
+    """Faces round the picture's border, of which most corners are beyond the guard band."""
+    rng = np.random.default_rng(2)
+    about = rng.uniform(-1.3, 1.3, (4000, 1, 2))
+    corners = (about + rng.uniform(-0.4, 0.4, (4000, 3, 2))).reshape(-1, 2)
+    w = 2.0 ** rng.integers(-2, 3, (12000, 1))  # powers of two, which take no digit of the corners
+    corners = corners.astype(np.float32).astype(float)
+    clip = jnp.asarray(np.concatenate([corners, 0 * w, 0 * w + 1], axis=1) * w, jnp.float32)
+    vertices = snap_vertices(clip, height=size, width=size)
+    faces = jnp.arange(12000, dtype=jnp.int32).reshape(-1, 3)
+    image = Image(size, size, subpixel_bits(size, size))
+    edges = set_up(corners_of(vertices, faces, jnp.arange(4000)), image, False).edges
+    places = rng.integers(0, size, (2, 300))
+    places[:, :150] = np.where(places[:, :150] < size // 2, 5, size - 5)  # of the image's corners
+    column, row = jnp.asarray(places, jnp.int32)
+    values = edge_value(Edge(*(member[..., None] for member in edges)), column, row)
+    inside = np.all(np.asarray(values) >= 0, axis=0)
+
+    x, y = ((2 * place + 1) / size - 1 for place in places)
+    a = corners.reshape(-1, 3, 2) * [1, -1]
+    b = np.roll(a, -1, axis=1)
+    cross = (b - a)[..., :1] * (y - a[..., 1:]) - (b - a)[..., 1:] * (x - a[..., :1])
+    distance = cross / np.linalg.norm(b - a, axis=-1, keepdims=True) * size / 2
+    truth = np.all(distance > 0, axis=1) | np.all(distance < 0, axis=1)
+    sure = np.min(np.abs(distance), axis=1) > 4 / 1024 * 2 ** (10 - image.bits)
+    assert np.sum(truth & sure) > 5000
+    np.testing.assert_array_equal(inside[sure], truth[sure])
 
 
 # ----------------------------------------------------------------- what must not change the answer

@@ -2,9 +2,9 @@
 
 Lines are cut in homogeneous coordinates, where a point behind the eye is as good as another: of
 A + t (B - A) the interval of t is kept in which near, far and a guard band round the image hold.
-The band is so wide that lines near the image stay whole, and so narrow that what follows can count
-in fixed point (`fixed_point.GUARD_BITS`). The cuts carry no derivative: a line that is cut keeps
-its direction, and its cut ends are where nobody looks.
+The band, twice as wide as that of triangles (`fixed_point.GUARD_BITS`), leaves lines near the image
+whole, and lets what follows count in fixed point. The cuts carry no derivative: a line that is cut
+keeps its direction, and its cut ends are where nobody looks.
 """
 
 from typing import NamedTuple
@@ -93,7 +93,7 @@ def _cut(points: Array, rank: Array, lines: Array, height: int, width: int) -> S
 
 def _interval(first: Array, second: Array, height: int, width: int) -> tuple[Array, Array]:
     """Bounds of t between near and far and inside the guard band; empty if the first is larger."""
-    guard = float(1 << (GUARD_BITS - subpixel_bits(height, width))) - 1
+    guard = float(2 << (GUARD_BITS - subpixel_bits(height, width))) - 1
     low, high = jnp.zeros_like(first[:, 0]), jnp.ones_like(first[:, 0])
 
     def distances(p: Array) -> list[Array]:

@@ -194,7 +194,7 @@ def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image)
     Between regular ends the edge is that of every other face. With one regular end it passes
     exactly through the snapped end, so that a fan round a vertex in view has no gaps, towards the
     other. Between two ends that are not regular it is their line, anchored where it comes nearest
-    to the image centre, or without a zero in the image if that is outside the guard band.
+    to the image centre, or without a zero in the image if that is farther than all of the image.
     """
     start_regular, end_regular = ((c.outcode & IRREGULAR) == 0 for c in (start, end))
     one, both = start_regular != end_regular, start_regular & end_regular
@@ -219,7 +219,8 @@ def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image)
     square = line[0] * line[0] + line[1] * line[1]
     foot = -line[2] / jnp.where(square > 0, square, 1)
     foot_x, foot_y = line[0] * foot, line[1] * foot
-    limit = float(1 << (GUARD_BITS - image.bits))
+    # The image may fill the guard band, whose corners are √2 times farther than its sides.
+    limit = 1.5 * (1 << (GUARD_BITS - image.bits))
     crosses = (square > 0) & (jnp.maximum(jnp.abs(foot_x), jnp.abs(foot_y)) <= limit)
 
     normal_x = jnp.where(one, -toward_y, jnp.where(crosses, line[0], 0))
