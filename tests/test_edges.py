@@ -429,6 +429,24 @@ def test_faces_with_a_vertex_near_the_eye_are_what_they_are_in_float64(distance)
     np.testing.assert_allclose(found.ends[..., seen], wanted[..., seen], atol=1e-3)
 
 
+def test_pleats_finer_than_pixels_show_a_mean_of_colours():
+    """Whatever the edges of their folds have in common, no colour counts less than nothing."""
+    size, pleats = 6, 150
+    first = np.arange(pleats)
+    x = np.stack([first, first + 1.2], axis=1).ravel() * (2.6 / pleats) - 1.3
+    z = np.tile([0.0, 0.02], pleats)
+    rows = [np.stack([x, np.full_like(x, y), z, np.ones_like(x)], axis=1) for y in (-1.3, 1.3)]
+    clip = jnp.asarray(np.concatenate(rows), jnp.float32)
+    sides = np.arange(x.size - 1)[:, None]
+    lower, upper = np.array([0, 1, x.size]), np.array([1, x.size + 1, x.size])
+    faces = np.concatenate([sides + lower, sides + upper])
+    face = dr.rasterize(clip, faces, height=size, width=size, border=1).face
+    colors = jax.random.uniform(jax.random.key(0), (size + 2, size + 2, 1))
+    weights = jax.jit(jax.jacobian(lambda colors: dr.antialias(colors, clip, faces, face)))(colors)
+    assert weights.min() > -0.02  # of a sum in steps
+    np.testing.assert_allclose(weights.sum(axis=(3, 4, 5)), 1, atol=1e-5)
+
+
 def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
     """Wherever they end, among edges or lines where bodies pierce each other."""
     sizes = AtOnce(edges=64, cut=1024, pieces=512, few=32, parts=16)
@@ -447,7 +465,7 @@ def test_no_piece_is_lost_however_few_records_there_are(monkeypatch):
         records, sums = collect(found, method)
 
         def change(points, colors):
-            return apply_linear(found, method, records, sums.rims, points, (colors, colors))
+            return apply_linear(found, method, records, sums.left, points, (colors, colors))
 
         points = jnp.ones((len(clip), 3)) * 0.1
         colors = jnp.ones((face.size, 3)) * jnp.arange(3.0)

@@ -144,7 +144,7 @@ BOUNDS = {
     "torus05": (0.027, 0.012, 4e-4),
     "lattice": (0.015, 0.015, 1e-4),
     "piercing": (0.003, 0.02, 1e-5),
-    "hills": (0.09, 0.04, 5.5e-4),
+    "hills": (0.055, 0.03, 4.5e-4),
     "shards": (0.07, 0.027, 3.5e-4),
     "shadow_sun": (0.01, 0.01, 2e-5),
     "shadow_hidden": (0.002, 0.015, 2e-6),
@@ -158,6 +158,9 @@ BETTER = {
     "lattice": (10, 16),
     "piercing": (100, 1),
 }
+# Errors of single pixels, of edges which the nearest surface on the screen does not hide, but the
+# next one.
+PIXELS = {"hills": {(53, 17): 0.008, (39, 70): 0.05, (40, 14): 0.008}}
 
 
 @pytest.mark.parametrize("name", BOUNDS)
@@ -169,8 +172,10 @@ def test_derivatives_are_those_of_the_box_filtered_image(name):
     for key, error in found.items():
         if name != "sphere" or not key.endswith("object rotation"):
             assert error < BOUNDS[name][key.startswith("L2")], (key, found)
-    # Rounding decides of hardly anything: of one pixel, and of shares of the derivatives.
     problem, image, projections, _ = results
+    for place, most in PIXELS.get(name, {}).items():
+        assert np.abs(image - reference.reference_image(problem))[place].max() < most, place
+    # Rounding decides of hardly anything: of one pixel, and of shares of the derivatives.
     _, moved, others, _ = results_at(name, 2e-7)
     pixel, share = (0.06, 0.01) if name in FINE else (0.005, 0.001)
     assert np.abs(moved - image).max() < pixel

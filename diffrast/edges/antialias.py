@@ -196,7 +196,7 @@ def antialias_image(
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
     (height, width), channels = view.size, view.image.shape[2]
-    capacity = ROWS_AT_ONCE * max(4, height * width // (10 * ROWS_AT_ONCE))
+    capacity = ROWS_AT_ONCE * max(4, height * width // (11 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
     find = over_views(lambda view: survey(view, method), height * width)
@@ -225,7 +225,7 @@ def antialias_image(
         records, sums = gather(now, method)
         assert sums is not None
         picture, made_of = finished(with_sums(image, sums, in_place=True), data)
-        return picture, (records, sums.rims, made_of)
+        return picture, (records, sums.left, made_of)
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, rest, data = primals
@@ -233,13 +233,13 @@ def antialias_image(
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(*primals)
         now = rest._replace(image=image, positions_clip=positions_clip)
-        now, data, (records, rims, found) = lax.stop_gradient((now, data, made_of))
+        now, data, (records, left, found) = lax.stop_gradient((now, data, made_of))
         d_means = d_image
         if finish is not None:
             d_means = finish.change(data, found, tangents[3], d_image)
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels), d_means.reshape(-1, channels)
-        d_out = apply_linear(now, method, records, rims, points, colors)
+        d_out = apply_linear(now, method, records, left, points, colors)
         return (out, made_of), d_out.reshape(height, width, channels)
 
     def of_picture(primals: Any, tangents: Any) -> tuple[Array, Array]:

@@ -25,6 +25,7 @@ from diffrast.edges.shadow_lines import Cast, Shadow, light_told
 from diffrast.edges.unseen import Survey
 from diffrast.edges.visibility import BACKGROUND, Seen
 
+LEFT_STEPS = 256  # to a pixel's area: `Sums.left` is kept in two bytes a pixel
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
 _SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
 
@@ -80,7 +81,7 @@ class Sums(NamedTuple):
 
     added: Float[Array, "pixels channels"]
     range: tuple[Array, Array]  # least and greatest colours that each pixel holds
-    rims: Float[Array, " pixels_with_border"] | None  # length of smooth rims about pixels' centres
+    left: Int[Array, " pixels"] | None  # area that what is at their centres leaves, in steps
 
 
 class Blended(NamedTuple):
@@ -93,14 +94,14 @@ class Blended(NamedTuple):
 def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Blended:
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
     channels, dtype = view.image.shape[2], view.image.dtype
-    records = rims = None
+    records = left = None
+    own = cropped(view.image, view.image.shape) + zero
     if method.capacity:
         records = no_records(method.capacity, channels, dtype, start, zero)
-        rims = jnp.zeros(view.face_image.size, dtype) + zero
+        left = jnp.zeros(own.shape[0], jnp.int16) + zero.astype(jnp.int16)
     if start is not None:
         return Blended(records, None)
-    own = cropped(view.image, view.image.shape) + zero
-    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), rims))
+    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), left))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:
@@ -213,9 +214,8 @@ def with_pieces(
     used = found.visible & (found.fold | (reduce(jnp.maximum, jnp.abs(jump)) > _NO_JUMP * size))
     held = front, behind, jnp.where(smooth, inner, front)
     rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
-    sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held)
-    if sums is not None and sums.rims is not None:
-        sums = sums._replace(rims=sums.rims.at[places[0]].add(rim_length))
+    leaves = area, found.front.look, found.beyond.look
+    sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held, leaves)
     start, end = segments.vertices[:, pieces.segment]
     rows = (
         jnp.stack([pixel, *places, start, end], axis=-1),
@@ -246,7 +246,8 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         right, left = _shade(view, method, told, *points)
     jump = stored(right - left)
     value = area * jump
-    sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left))
+    leaves = area, line.look[1], line.look[0]
+    sums, own = _with_values(total.sums, view, line.pixel, line.used, value, (right, left), leaves)
     corners = view.faces[line.face].transpose(0, 2, 1).reshape(3, 2, -1)
     motion = line.motion.reshape(3, 6, -1)
     use = jnp.stack([line.used] * 3)
@@ -266,7 +267,8 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
     value = area * jump + jnp.where(line.wrong_side, to_other, 0)
     held = own, own + to_other
-    sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held)
+    leaves = area, line.look[1], line.look[0]
+    sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held, leaves)
     places = [_place(view, line.pixel, look) for look in line.look]
     use = jnp.stack([line.used] * 3 + [line.used & view.cast.parallel])
     vertices, motion = line.vertices, line.motion
@@ -281,8 +283,12 @@ def _with_values(
     used: Bool[Array, " n"],
     value: Float[Array, "channels n"],
     held: Sequence[Float[Array, "channels n"]],
+    leaves: tuple[Float[Array, " n"], Int[Array, " n"], Int[Array, " n"]],
 ) -> tuple[Sums | None, Int[Array, " n"]]:
-    """Add values to pixels and widen the range of their colours; also the pixels' numbers."""
+    """Add values to pixels and widen the range of their colours; also the pixels' numbers.
+
+    What one of the 3×3 pixels shows leaves an area to what another one does.
+    """
     number = stored(jnp.where(used, number_of_pixel(view, pixel), view.face_image.size))
     if total is None:
         return None, number
@@ -290,7 +296,13 @@ def _with_values(
     low, high = total.range
     low = low.at[number].min(stored(reduce(jnp.minimum, held)).T, mode="drop")
     high = high.at[number].max(stored(reduce(jnp.maximum, held)).T, mode="drop")
-    return total._replace(added=added, range=(low, high)), number
+    left = total.left
+    if left is not None:
+        area, here, there = leaves
+        share = jnp.where(here == 4, area, 0) - jnp.where(there == 4, area, 0)
+        steps = stored(jnp.round(LEFT_STEPS * share).astype(left.dtype))
+        left = left.at[number].add(steps, mode="drop")
+    return Sums(added, (low, high), left), number
 
 
 def with_sums(

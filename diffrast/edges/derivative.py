@@ -15,7 +15,7 @@ from diffrast._device import at_once, most, over_views
 from diffrast._linear import linear_map, linear_zeros
 from diffrast._selection import batches_of
 from diffrast._stored import stored
-from diffrast.edges.blend import Method, View, cropped
+from diffrast.edges.blend import LEFT_STEPS, Method, View, cropped
 from diffrast.edges.collect import collect
 from diffrast.edges.records import Records, Start
 
@@ -81,11 +81,27 @@ def _over_pieces(
     return _over_rows(records, adds[1], total) if len(adds) > 1 else total
 
 
+def _area(area: Array, pixel: Array, left: Array) -> Array:
+    """How much of pixels shows another one's change in place of that at their centres.
+
+    Where a surface begins to fold, there are many edges in a pixel, all of which part what its
+    centre shows from what the next one does: together they leave no more than all of it.
+    """
+    steps = left[pixel].astype(area.dtype)
+    return (area / jnp.maximum(steps / LEFT_STEPS, 1))[:, None]
+
+
+def _mean(total: Array, length: Array, other: Array) -> Array:
+    """What lengths of rims add up to over their sum, or something else where there are none."""
+    rim = (length > 0)[:, None]
+    return jnp.where(rim, total / jnp.where(rim, length[:, None], 1), other)
+
+
 def _push(
     view: View,
     method: Method,
     records: Records,
-    rims: Array,
+    left: Array,
     points: Array,
     colors: tuple[Array, Array],
     added: Array,
@@ -96,71 +112,71 @@ def _push(
     at the next pixel's stands for it, less what `_along` takes off.
     """
     centres, means = colors
-    rim = rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
 
-    def average(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        averages, added = total
-        integers, _, weights, _ = rows
+    def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        averages, lengths, added = total
+        integers, _, sizes, _ = rows
         _, front, _, inner, _, _ = integers.T
-        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return averages.at[front].add(share[:, None] * centres[inner]), added
+        length = jnp.where(used, sizes[:, 1], 0)
+        averages = averages.at[front].add(length[:, None] * centres[inner])
+        return averages, lengths.at[front].add(length), added
 
-    def add(used: Array, rows: Any, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        averages, added = total
-        integers, jump, weights, motion = rows
+    def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
+        averages, lengths, added = total
+        integers, jump, sizes, motion = rows
         pixel, front, beyond, _, start, end = integers.T
-        here, there = (jnp.where(rim[i, None], averages[i], means[i]) for i in (front, beyond))
+        here, there = (_mean(averages[i], lengths[i], means[i]) for i in (front, beyond))
         moved = jnp.sum(motion[:, :3] * points[start] + motion[:, 3:] * points[end], axis=1)
-        value = moved[:, None] * jump + weights[:, :1] * (there - here)
-        return averages, added.at[pixel].add(jnp.where(used[:, None], value, 0))
+        value = moved[:, None] * jump + _area(sizes[:, 0], pixel, left) * (there - here)
+        return averages, lengths, added.at[pixel].add(jnp.where(used[:, None], value, 0))
 
     adds = [add] if method.shader is None else [average, add]
-    start = jnp.zeros_like(centres), added
-    averages, added = _over_pieces(view, method, records, adds, start)
-    return added + cropped(jnp.where(rim[:, None], averages, means), view.image.shape)
+    start = jnp.zeros_like(centres), jnp.zeros_like(centres[:, 0]), added
+    averages, lengths, added = _over_pieces(view, method, records, adds, start)
+    return added + cropped(_mean(averages, lengths, means), view.image.shape)
 
 
 def _pull(
-    view: View, method: Method, records: Records, rims: Array, cotangent: Array
+    view: View, method: Method, records: Records, left: Array, cotangent: Array
 ) -> tuple[Array, tuple[Array, Array]]:
     """The transpose of `_push`: what a change of the image means for `points` and `colors`."""
-    rim = rims > 0
-    inverse = jnp.where(rim, 1, 0) / jnp.where(rim, rims, 1)
     # What the cotangent is made of need not be held any longer, then.
     cotangent = stored(cotangent, cropped(view.image, view.image.shape))
     own = cotangent.reshape(*view.size, -1)
-    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(rim.size, -1)
+    own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(view.face_image.size, -1)
 
     def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, inwards = total
-        integers, jump, weights, motion = rows
+        points, own, lengths, inwards = total
+        integers, jump, sizes, motion = rows
         pixel, front, beyond, _, start, end = integers.T
         value = jnp.where(used[:, None], cotangent[pixel], 0)
         along = jnp.sum(value * jump, axis=1)[:, None]
         points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
-        value = value * weights[:, :1]
-        return points, own.at[beyond].add(value).at[front].add(-value), inwards
+        value = value * _area(sizes[:, 0], pixel, left)
+        own = own.at[beyond].add(value).at[front].add(-value)
+        return points, own, lengths.at[front].add(jnp.where(used, sizes[:, 1], 0)), inwards
 
     def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
-        points, own, inwards = total
-        integers, _, weights, _ = rows
+        points, own, lengths, inwards = total
+        integers, _, sizes, _ = rows
         _, front, _, inner, _, _ = integers.T
-        share = jnp.where(used, weights[:, 1], 0) * inverse[front]
-        return points, own, inwards.at[inner].add(share[:, None] * own[front])
+        length = jnp.where(used, sizes[:, 1], 0)
+        value = _mean(length[:, None] * own[front], lengths[front], jnp.zeros_like(own[front]))
+        return points, own, lengths, inwards.at[inner].add(value)
 
     adds = [add] if method.shader is None else [add, average]
     points = linear_zeros((view.positions_clip.shape[0], 3), cotangent)
-    start = points, own, linear_zeros(own.shape, cotangent)
-    points, own, inwards = _over_pieces(view, method, records, adds, start)
-    return points, (inwards, jnp.where(rim[:, None], 0, own))
+    inwards = linear_zeros(own.shape, cotangent)
+    start = points, own, jnp.zeros_like(own[:, 0]), inwards
+    points, own, lengths, inwards = _over_pieces(view, method, records, adds, start)
+    return points, (inwards, jnp.where(lengths[:, None] > 0, 0, own))
 
 
 def apply_linear(
     view: View,
     method: Method,
     records: Records,
-    rims: Array,
+    left: Array,
     points: Array,
     colors: tuple[Array, Array],
 ) -> Array:
@@ -170,12 +186,12 @@ def apply_linear(
     """
 
     def each_view(way: Callable[..., Any]) -> Callable[..., Any]:
-        return over_views(lambda view, *rest: way(view, method, *rest), rims.size)
+        return over_views(lambda view, *rest: way(view, method, *rest), view.face_image.size)
 
     push, pull = each_view(_push), each_view(_pull)
     return linear_map(
-        lambda changes, nothing: push(view, records, rims, *changes, nothing),
-        lambda cotangent: pull(view, records, rims, cotangent),
+        lambda changes, nothing: push(view, records, left, *changes, nothing),
+        lambda cotangent: pull(view, records, left, cotangent),
         (points, colors),
         jnp.zeros_like(cropped(colors[0], view.image.shape)),
     )

@@ -44,8 +44,8 @@ class Spot(NamedTuple):
 class Outwards(NamedTuple):
     """Ways to the point just beyond a piece."""
 
-    # Faces of a surface that may hide it, and of two that may lie behind; or -1.
-    starts: Int[Array, "3 n"]
+    # Faces of two surfaces that may hide it, and of two that may lie behind; or -1.
+    starts: Int[Array, "4 n"]
     search: Bool[Array, " n"]  # whether something may lie behind that is not found yet,
     least: Float[Array, " n"]  # with more than this 1/w,
     found: Bool[Array, " n"]  # or instead of nothing
@@ -79,11 +79,12 @@ def outwards(
 ) -> Outwards:
     """From where to walk to the point just beyond.
 
-    From where a surface is seen that would hide the piece if it reached it; and where nothing is
-    found behind, or one is seen that would lie before that, from what is seen beyond or, if that
-    does not fit, from the nearest one that does; and from the farthest other one, or one that is
-    not seen. What hides an edge that is no fold is mostly the other side of its own body, so its
-    second walk starts from what is seen last before it.
+    From where a surface is seen that would hide the piece if it reached it: the nearest one on the
+    screen and, for a fold, the one that is least in front of it. Where nothing is found behind, or
+    one is seen that would lie before that, from what is seen beyond or, if that does not fit, from
+    the nearest one that does; and from the farthest other one, or one that is not seen. What hides
+    an edge that is no fold is mostly the other side of its own body, so its second walk starts from
+    what is seen last before it.
 
     Args:
         spot: of pieces.
@@ -103,7 +104,7 @@ def outwards(
     masks = jnp.stack([(fold | crease) & before, search & after])
     points = jnp.stack([spot.middle, spot.middle + LOOK * spot.out])
     hiding, behind = jax.vmap(_seen_nearest, in_axes=(0, None, 0))(masks, pictured, points)
-    last = _seen_least(crease & before, pictured, depths)
+    last = _seen_least((fold | crease) & before, pictured, depths)
     shown_fits = picked(after, look) | (behind < 0)
     behind = jnp.where(shown_fits, jnp.where(search, shown, -1), behind)
     behind = stored(jnp.where(crease, last, behind))
@@ -111,7 +112,8 @@ def outwards(
     second = _seen_least(others, pictured, depths)
     starts = search & (second < 0) & (farthest != own[0]) & (farthest != own[1])
     second = jnp.where(starts, farthest, second)
-    return Outwards(jnp.stack([hiding, behind, second]), search, least, found, shown)
+    last = jnp.where(fold & (last != hiding), last, -1)
+    return Outwards(jnp.stack([hiding, last, behind, second]), search, least, found, shown)
 
 
 def inwards(
@@ -160,7 +162,7 @@ def walked(
     near, own = spot.near, spot.own
     starts = jnp.concatenate([outward.starts, inward.starts])
     inside, outside = distances
-    away = jnp.stack([outside * spot.out] * 3 + [-inside * spot.out] * 2, axis=1)
+    away = jnp.stack([outside * spot.out] * 4 + [-inside * spot.out] * 2, axis=1)
     starts, (x, y) = stored_together(
         (jnp.where(visible, starts, -1), (spot.centre + spot.middle)[:, None] + away)
     )
@@ -168,26 +170,26 @@ def walked(
     arrives = there & (reached >= 0)
     depth = edge_values(corners_of(reached, surface.faces, surface.pixels), x, y)[1]
     in_front = depth > near * (1 + FINE_TOLERANCE)
-    touches = ~in_front[3:] & (depth[3:] > near * (1 - FINE_TOLERANCE))
-    connected = inward.plain | (arrives[3:] & (touches | (reached[3:] == spot.front)))
+    touches = ~in_front[4:] & (depth[4:] > near * (1 - FINE_TOLERANCE))
+    connected = inward.plain | (arrives[4:] & (touches | (reached[4:] == spot.front)))
     connected = connected & inward.alike
-    hides = arrives[:3] & (reached[:3] != own[0]) & (reached[:3] != own[1]) & in_front[:3]
-    lies = outward.search & arrives[1:3] & ~hides[1:] & (depth[1:3] > outward.least)
-    nearer_lies = lies & (depth[1:3] >= jnp.where(lies, depth[1:3], 0)[::-1])
-    ends = outward.search & ~outward.found & there[1] & (reached[1] < 0) & (outward.shown >= 0)
-    hidden = hides[0] | hides[1]
+    hides = arrives[:4] & (reached[:4] != own[0]) & (reached[:4] != own[1]) & in_front[:4]
+    lies = outward.search & arrives[2:4] & ~hides[2:] & (depth[2:4] > outward.least)
+    nearer_lies = lies & (depth[2:4] >= jnp.where(lies, depth[2:4], 0)[::-1])
+    ends = outward.search & ~outward.found & there[2] & (reached[2] < 0) & (outward.shown >= 0)
+    hidden = hides[0] | hides[1] | hides[2]
     # Held: combined once more for each of their uses they are no vector code.
     connected, lies, nearer_lies, hidden, ends = stored_together(
         (connected, lies, nearer_lies, hidden, ends & ~lies[1])
     )
-    behind = jnp.where(nearer_lies[0], reached[1], jnp.where(lies[1], reached[2], -1))
+    behind = jnp.where(nearer_lies[0], reached[2], jnp.where(lies[1], reached[3], -1))
     return Walked(
         hidden,
         behind,
         ends,
         connected,
-        inside=jnp.stack([x[3], y[3]]),
-        beyond=jnp.stack([x[1], y[1]]),
+        inside=jnp.stack([x[4], y[4]]),
+        beyond=jnp.stack([x[0], y[0]]),
     )
 
 
