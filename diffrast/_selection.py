@@ -5,6 +5,7 @@ until none is left. Most images have few chosen pixels, so blocks without any ar
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import TypeVar
 
 import jax
@@ -54,29 +55,35 @@ def compacted(
 
 
 def selected(
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, "*shape"],
     holds: Callable[[Int[Array, " some"]], Bool[Array, " some"]] | None = None,
 ) -> tuple[Int[Array, " more"], Int[Array, ""]]:
     """Indices of what is true, ascending, and how many; the list is a little longer than the mask.
 
-    On a CPU blocks in which something is true are found first, and only these are looked through.
-    So what takes longer to find out is asked only there: whether it `holds`, too, at such indices.
+    They count its entries, whatever its shape. On a CPU blocks in which something is true are found
+    first, and only these are looked through. So what takes longer to find out is asked only there:
+    whether it `holds`, too, at such indices.
     """
     if not draws_on_cpu():
-        indices = jnp.arange(mask.size, dtype=jnp.int32)
-        return compacted(mask if holds is None else mask & holds(indices), indices)
-    count = -(-mask.size // _BLOCK)
-    blocks = stored(
-        jnp.pad(mask, (0, count * _BLOCK - mask.size)).reshape(count, _BLOCK).astype(jnp.int8)
+        indices, flat = jnp.arange(mask.size, dtype=jnp.int32), mask.reshape(-1)
+        return compacted(flat if holds is None else flat & holds(indices), indices)
+    # Found out in the mask's own shape: of others, and of what is padded, no loop is vectorised.
+    flat = stored(mask.astype(jnp.int8)).reshape(-1)
+    count = flat.size // _BLOCK
+    words = lax.bitcast_convert_type(
+        flat[: count * _BLOCK].reshape(count, _BLOCK // 4, 4), jnp.int32
     )
-    block_list, block_count = compacted(
-        jnp.max(blocks, axis=1) > 0, jnp.arange(count, dtype=jnp.int32)
-    )
+    holds_some = reduce(jnp.bitwise_or, list(words.T)) != 0
+    if flat.size % _BLOCK:
+        holds_some = jnp.append(holds_some, jnp.max(flat[count * _BLOCK :]) > 0)
+    blocks = jnp.arange(holds_some.size, dtype=jnp.int32)
+    block_list, block_count = compacted(holds_some, blocks)
 
     def add(block: Array, exists: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         indices, total = state
-        chosen = ((blocks[block] > 0) & exists[:, None]).reshape(-1)
         number = (block[:, None] * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)).reshape(-1)
+        there = jnp.repeat(exists, _BLOCK) & (number < flat.size)
+        chosen = there & (flat[jnp.minimum(number, flat.size - 1)] > 0)
         more, added = compacted(chosen if holds is None else chosen & holds(number), number)
         return lax.dynamic_update_slice(indices, more, (total,)), total + added
 

@@ -104,7 +104,7 @@ def choose_pixels(
     """
     # Else all bodies would be looked up, and held, before there is anything unseen.
     first, last = bodies_round(face_image, bodies + zero_after(unseen[0]))
-    return selected((first + last > bodies.size + 1).reshape(-1) | (unseen >= 0))
+    return selected((first + last > bodies.size + 1) | (unseen >= 0).reshape(first.shape))
 
 
 def bodies_round(
@@ -151,7 +151,7 @@ def cross(
     coarse = stored(~planes.fine)
     wanted = (coarse[:, None] & coarse).at[0, 1].set(coarse[0] & coarse[1] | met)
     once = np.tri(_FACES, k=-1, dtype=bool).T[..., None]
-    return Crossings(pixel, planes, unit, *selected((once & differ & meet & wanted).reshape(-1)))
+    return Crossings(pixel, planes, unit, *selected(once & differ & meet & wanted))
 
 
 def _candidates(

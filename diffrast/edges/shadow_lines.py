@@ -143,7 +143,7 @@ def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
     below = below[:, :-2] | below[:, 1:-1]
     right = right[:, :, :-2] | right[:, :, 1:-1]
     below = below[:, :, :-2] | below[:, :, 1:-1] | below[:, :, 2:]
-    return selected((right | below).reshape(-1))
+    return selected(right | below)
 
 
 @jax.jit
@@ -268,7 +268,7 @@ def cross_shadows(
     zero = jnp.zeros_like(source[0])
     low, high = positive_part(inside(foot - along), inside(foot + along))
     drawn = (chosen[:, None] & usable & (low < high)).reshape(_EDGES * _FACES, -1)
-    lines, total = selected(drawn.reshape(-1))
+    lines, total = selected(drawn)
     return Outlines(
         places=places,
         face=ground_face,

@@ -157,7 +157,7 @@ def _hidden(
 
     def follow(turn: Array, fate: Array) -> Array:
         others = (nine != 4) & (sight.before > 0) & (fate < _HIDDEN)
-        ways, size = selected(jnp.ravel(doubt & jnp.where(turn == 0, nine == 4, others)))
+        ways, size = selected(doubt & jnp.where(turn == 0, nine == 4, others))
         return work_off(size, at_once, lambda slot: begin(ways[slot]), walk, fate)
 
     fate = lax.fori_loop(0, 2, follow, (doubt & False).astype(jnp.int32))
