@@ -541,6 +541,45 @@ def test_edges_cost_nothing_where_they_are_off():
 
 # The stage alone ----------------------------------------------------------------------------------
 
+
+def test_behind_an_edge_is_the_background_of_its_own_pixel():
+    """A pixel of which a body covers the share a is a color + (1 - a) background, if that is a
+    picture, too; a is that of a white body before black.
+    """
+    rng = np.random.default_rng(0)
+    color, backgrounds = jnp.array([0.9, 0.1, 0.5]), jnp.asarray(rng.random((2, 16, 16, 3)))
+    options = dr.RenderSettings(height=16, width=16, shading="unlit")
+    body = dr.shapes.plane(2.0, 2.0), dr.linalg.rotation_z(0.3)
+
+    def picture(shift, color, background, options=options):
+        mesh, turn = body
+        material, place = dr.Material(diffuse=color), dr.linalg.translation(shift) @ turn
+        scene = dr.Scene(objects=[dr.Object(mesh, material, place)], background=background)
+        view = dr.Camera.perspective(eye=(0, 0, 4), target=(0, 0, 0), fov_y=0.9, near=1, far=9)
+        return dr.render(scene, view, options)
+
+    def share(shift):
+        return picture(shift, jnp.ones(3), jnp.zeros(3))
+
+    def want(shift, color, background):
+        covered = share(shift)
+        return covered * color + (1 - covered) * background
+
+    at = jnp.array([0.1, 0.05, 0.0]), color, backgrounds[0]
+    change = jnp.array([0.5, -0.3, 0.2]), jnp.array([-0.4, 0.2, 0.6]), backgrounds[1]
+    got, d_got = jax.jit(lambda at, way: jax.jvp(picture, at, way))(at, change)
+    expected, d_expected = jax.jit(lambda at, way: jax.jvp(want, at, way))(at, change)
+    np.testing.assert_allclose(got, expected, atol=2e-6)
+    np.testing.assert_allclose(d_got, d_expected, atol=2e-5)
+    samples = dataclasses.replace(options, samples=1024, antialias=False)
+    np.testing.assert_allclose(got, picture(*at, options=samples), atol=2e-3)
+
+    weights = jnp.asarray(rng.normal(size=got.shape), got.dtype)
+    back = jax.jit(jax.grad(lambda at: jnp.vdot(weights, picture(*at))))(at)
+    together = sum(jnp.vdot(*pair) for pair in zip(back, change, strict=True))
+    np.testing.assert_allclose(together, jnp.vdot(weights, d_got), rtol=1e-4)
+
+
 COLORS = 0.5 + 0.5 * jnp.sin(2 * MESH.vertices)  # of the vertices; the background is white
 
 

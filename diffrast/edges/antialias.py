@@ -196,6 +196,7 @@ def antialias_image(
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
     (height, width), channels = view.size, view.image.shape[2]
+    pictured = view.background.ndim == 3
     capacity = ROWS_AT_ONCE * max(4, height * width // (11 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
@@ -210,35 +211,41 @@ def antialias_image(
         return (picture, None) if finish is None else finish.draw(data, picture)
 
     @jax.custom_jvp
-    def blended(image: Array, positions_clip: Array, rest: View, data: Any) -> Array:
-        now = rest._replace(image=image, positions_clip=positions_clip)
+    def blended(
+        image: Array, positions_clip: Array, background: Array, rest: View, data: Any
+    ) -> Array:
+        now = rest._replace(image=image, positions_clip=positions_clip, background=background)
         _, sums = gather(now, method._replace(capacity=0))
         assert sums is not None
         return finished(with_sums(image, sums), data)[0]
 
     @jax.custom_jvp
     def recorded(
-        image: Array, positions_clip: Array, rest: View, data: Any
+        image: Array, positions_clip: Array, background: Array, rest: View, data: Any
     ) -> tuple[Array, tuple[Any, ...]]:
         """The same, and what its derivative is made of."""
-        now = rest._replace(image=image, positions_clip=positions_clip)
+        now = rest._replace(image=image, positions_clip=positions_clip, background=background)
         records, sums = gather(now, method)
         assert sums is not None
         picture, made_of = finished(with_sums(image, sums, in_place=True), data)
         return picture, (records, sums.left, made_of)
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
-        image, positions_clip, rest, data = primals
-        d_image, d_clip, _ = without_known_zeros((*tangents[:2], tangents[3]))
+        image, positions_clip, background, rest, data = primals
+        d_bare = tangents[2] if pictured else ()
+        d_image, d_clip, d_bare, _ = without_known_zeros((*tangents[:2], d_bare, tangents[4]))
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(*primals)
-        now = rest._replace(image=image, positions_clip=positions_clip)
+        now = rest._replace(image=image, positions_clip=positions_clip, background=background)
         now, data, (records, left, found) = lax.stop_gradient((now, data, made_of))
         d_means = d_image
         if finish is not None:
-            d_means = finish.change(data, found, tangents[3], d_image)
+            d_means = finish.change(data, found, tangents[4], d_image)
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels), d_means.reshape(-1, channels)
+        if pictured:
+            bare = d_bare.reshape(-1, channels)
+            colors = jax.tree.map(lambda of_image: jnp.concatenate([of_image, bare]), colors)
         d_out = apply_linear(now, method, records, left, points, colors)
         return (out, made_of), d_out.reshape(height, width, channels)
 
@@ -253,4 +260,6 @@ def antialias_image(
     blended.defjvp(of_picture, symbolic_zeros=True)
     recorded.defjvp(of_recorded, symbolic_zeros=True)
     data = None if finish is None else finish.data
-    return blended(view.image, view.positions_clip, lax.stop_gradient(view), data)
+    # A background of one colour moves with the image, which shows it.
+    background = view.background if pictured else lax.stop_gradient(view.background)
+    return blended(view.image, view.positions_clip, background, lax.stop_gradient(view), data)

@@ -133,7 +133,8 @@ def _push(
     adds = [add] if method.shader is None else [average, add]
     start = jnp.zeros_like(centres), jnp.zeros_like(centres[:, 0]), added
     averages, lengths, added = _over_pieces(view, method, records, adds, start)
-    return added + cropped(_mean(averages, lengths, means), view.image.shape)
+    own = _mean(averages, lengths, means)[: view.face_image.size]
+    return added + cropped(own, view.image.shape)
 
 
 def _pull(
@@ -144,6 +145,7 @@ def _pull(
     cotangent = stored(cotangent, cropped(view.image, view.image.shape))
     own = cotangent.reshape(*view.size, -1)
     own = jnp.pad(own, ((1, 1), (1, 1), (0, 0))).reshape(view.face_image.size, -1)
+    own = jnp.pad(own, ((0, view.colors - own.shape[0]), (0, 0)))
 
     def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
         points, own, lengths, inwards = total
@@ -182,7 +184,8 @@ def apply_linear(
 ) -> Array:
     """`_push`, of which JAX knows both directions.
 
-    The change of colours is given twice, at the centres of pixels and of their means.
+    The change of colours is given twice, at the centres of pixels and of their means; each time
+    that of the image, and then that of a background which is one.
     """
 
     def each_view(way: Callable[..., Any]) -> Callable[..., Any]:
@@ -193,5 +196,5 @@ def apply_linear(
         lambda changes, nothing: push(view, records, left, *changes, nothing),
         lambda cotangent: pull(view, records, left, cotangent),
         (points, colors),
-        jnp.zeros_like(cropped(colors[0], view.image.shape)),
+        jnp.zeros((view.size[0] * view.size[1], colors[0].shape[1]), colors[0].dtype),
     )
