@@ -65,7 +65,7 @@ def cast_outlines(
     world: World, topology: Topology, points: Points, reached: Reached
 ) -> Cast | None:
     """The outlines of shadows between the pixels of an image; None without shadows."""
-    scene, camera, geometry, shadows = world[:4]
+    scene, camera, _, shadows = world[:4]
     if shadows is None:
         return None
     casting = [light for light in scene.lights if casts_shadow(light)]
@@ -73,14 +73,14 @@ def cast_outlines(
         [
             direction_to_clip(camera, light.direction)
             if isinstance(light, DirectionalLight)
-            else world_to_clip(camera, light.position)
+            else world_to_clip(replace(camera, distortion=None), light.position)
             for light in casting
         ]
     )
     weight = [0 if isinstance(light, DirectionalLight) else 1 for light in casting]
     lit = jnp.stack([part > 0 for part in reached if part is not None])
     return Cast(
-        edge=outlines(scene.lights, shadows, geometry, topology, points, lit),
+        edge=outlines(scene.lights, shadows, topology, points, lit),
         lit=lit,
         patches=topology.patches,
         turned=jnp.stack(shadows.turned),
@@ -94,7 +94,7 @@ def receive_shadows(world: World, points: Points, told: Array | None = None) -> 
     """Which lights reach points, where it is not `told` for those with shadows: 1, 0, or -1."""
     if world.shadows is None:
         return (None,) * len(world.scene.lights)
-    return receive(world.scene.lights, world.shadows, world.geometry, points, told)
+    return receive(world.scene.lights, world.shadows, points, told)
 
 
 def glow(shading: str, world: World, light: Array, points: Points) -> Columns:

@@ -17,6 +17,7 @@ from diffrast.bending import Chosen
 from diffrast.edges.neighborhood import Surface, walk
 from diffrast.edges.pieces import to_pixels
 from diffrast.edges.planes import FINE_TOLERANCE, corners_of, covers, edge_values
+from diffrast.raster.evaluate import unit_of
 from diffrast.shadows import Reached
 
 _POINTS_AT_ONCE = 512  # that may be hidden
@@ -95,7 +96,7 @@ def faces_at(
     count = chosen.parts
 
     def find(found: Array) -> Array:
-        pixels = stored(to_pixels(clip, height, width))
+        pixels = stored(to_pixels(clip / unit_of(clip), height, width))
         neighbors = lax.cond(jnp.any(apart), _parted, _together, topology, apart)
         surface = Surface(faces, pixels, topology._replace(neighbors=neighbors), volume)
 

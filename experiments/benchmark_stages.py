@@ -94,8 +94,8 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
     def antialias(image: jax.Array, clip: jax.Array, face: jax.Array) -> jax.Array:
         return dr.antialias(image, clip, mesh.faces, face, topology=mesh.topology)
 
-    def look_up(geometry: Any, points: Any, shadows: Any) -> Any:
-        return receive(scene.lights, shadows, geometry, points)
+    def look_up(points: Any, shadows: Any) -> Any:
+        return receive(scene.lights, shadows, points)
 
     return {
         "vertices to clip space": Stage(
@@ -139,7 +139,7 @@ def stages(mesh: dr.Mesh, camera: dr.Camera, size: int) -> dict[str, Stage]:
         ),
         "shadow look-up": Stage(
             look_up,
-            (geometry, points, shadows),
+            (points, shadows),
             FLOAT * (9 * pixels + SHADOW_SIZE**2),
             40 * covered,
         ),

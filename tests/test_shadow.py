@@ -103,6 +103,45 @@ def test_shadows_have_no_scale(scale):
     assert np.mean(got != want) < 5e-4
 
 
+@pytest.mark.parametrize("light", [sun, lambda: lamp((1.5, 4.0, 1.0))], ids=["sun", "lamp"])
+def test_a_scale_by_a_power_of_two_changes_no_bit(light):
+    """With edges and shadows, of pictures and derivatives: products of lengths stay in range."""
+    options = dr.RenderSettings(height=24, width=24)
+
+    def picture(move, scale):
+        size = linalg.scaling(jnp.full(3, scale))
+        ball_place = linalg.translation(scale * (move + jnp.array([0.1, 0.8, 0.2]))) @ size
+        own = light()
+        if isinstance(own, dr.PointLight):
+            own = replace(own, position=scale * own.position)
+        scene = dr.Scene(
+            objects=[
+                dr.Object(shapes.icosphere(2, 0.6), transform=ball_place),
+                dr.Object(floor().mesh, transform=size @ floor(height=0.0).transform),
+            ],
+            lights=[own],
+        )
+        camera = dr.Camera.perspective(
+            eye=scale * jnp.array([1.0, 3.0, 5.0]),
+            target=scale * jnp.array([0.0, 0.4, 0.0]),
+            fov_y=0.6,
+            near=0.5 * scale,
+            far=20 * scale,
+        )
+        return dr.render(scene, camera, options)
+
+    @jax.jit
+    def with_derivative(scale):
+        way = jnp.array([0.3, 0.1, 0.2])
+        return jax.jvp(lambda move: picture(move, scale), (jnp.zeros(3),), (way,))
+
+    want = with_derivative(1.0)
+    assert all(np.ptp(part) > 0.1 for part in want)
+    for exponent in (-60, -40, 40, 60):
+        got = with_derivative(2.0**exponent)
+        jax.tree.map(np.testing.assert_array_equal, got, want)
+
+
 def test_what_casts_a_shadow_need_not_be_seen():
     """The ball is behind the camera; only the floor is in view."""
     scene, _ = make("ball")

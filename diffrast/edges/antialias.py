@@ -21,6 +21,7 @@ from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.shadow_lines import with_lights
 from diffrast.edges.survey import survey
+from diffrast.raster.evaluate import unit_of
 
 CREASES = ("none", "seams", "all")
 
@@ -158,8 +159,8 @@ def with_depth(view: View) -> View:
     Lights and their weights follow its positions, then, if it has shadows.
     """
     height, width = view.size
-    depth = depth_of(view.positions_clip)
-    scale = scale_by_depth(depth, view.positions_clip)
+    depth, unit = depth_of(view.positions_clip), unit_of(view.positions_clip)
+    scale = scale_by_depth(depth, view.positions_clip) / unit
     if view.topology.bodies is None and view.cast is None:
         # It moves nothing but lines in which planes meet.
         scale = lax.stop_gradient(scale)
@@ -170,7 +171,7 @@ def with_depth(view: View) -> View:
 
     volume = over_views(volume_of, height * width)(lax.stop_gradient(positions_clip), view.faces)
     if view.cast is not None:
-        cast, rows = with_lights(view.cast, depth)
+        cast, rows = with_lights(view.cast, depth, unit)
         positions_clip = jnp.concatenate([positions_clip, rows])
         view = view._replace(cast=cast)
     return view._replace(positions_clip=positions_clip, scale=scale, volume=volume)

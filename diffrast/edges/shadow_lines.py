@@ -125,15 +125,17 @@ class Shadow(NamedTuple):
     motion: Float[Array, "4 6 n"]  # area on the right with x, y and w of these
 
 
-def with_lights(cast: Cast, depth: Depth) -> tuple[Cast, Float[Array, "rows 4"]]:
+def with_lights(
+    cast: Cast, depth: Depth, unit: Float[Array, ""]
+) -> tuple[Cast, Float[Array, "rows 4"]]:
     """Shadows as this projection has them, and what follows the vertices' positions.
 
-    First the lights, then their weights in the place of w, so that they may move.
+    First the lights, in such units, then their weights in the place of w, so that they may move.
     """
     weight = jnp.where(depth.parallel, depth.weight(cast.source), cast.weight)
     rows = jnp.zeros_like(cast.source).at[:, 3].set(weight)
     cast = cast._replace(weight=weight, parallel=depth.parallel)
-    return cast, jnp.concatenate([cast.source, rows])
+    return cast, jnp.concatenate([cast.source / unit, rows])
 
 
 def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:

@@ -352,16 +352,21 @@ def corners_at(faces: Int[Array, "F 3"], face: Int[Array, "*size"]) -> list[Int[
 
 
 def scaled(positions_clip: Float[Array, "V 4"]) -> Scaled:
-    """Clip positions in units in which products stay in range.
+    """Clip positions in units in which products stay in range, see `unit_of`.
 
-    The unit is a power of two: the division rounds nothing. Positions that are not finite become
-    zero: no visible face has them, but the background evaluates face 0.
+    Positions that are not finite become zero: no visible face has them, but the background
+    evaluates face 0.
     """
     finite = jnp.all(jnp.isfinite(positions_clip), axis=1)
-    columns = [jnp.where(finite, positions_clip[:, i], 0) for i in (0, 1, 3)]
-    largest = jnp.max(jnp.abs(lax.stop_gradient(jnp.stack(columns))))
-    unit = jnp.ldexp(jnp.ones_like(largest), jnp.frexp(largest)[1] - 1)
-    return Scaled([column / unit for column in columns], unit)
+    unit = unit_of(positions_clip)
+    return Scaled([jnp.where(finite, positions_clip[:, i], 0) / unit for i in (0, 1, 3)], unit)
+
+
+def unit_of(points: Float[Array, "V columns"]) -> Float[Array, ""]:
+    """A power of two, by which coordinates are divided without rounding, to be two at most."""
+    finite = jnp.all(jnp.isfinite(points), axis=1, keepdims=True)
+    largest = jnp.max(jnp.abs(jnp.where(finite, lax.stop_gradient(points), 0)))
+    return jnp.ldexp(jnp.ones_like(largest), jnp.frexp(largest)[1] - 1)
 
 
 def _offset(numerator: Array, w: Array, size: Array, centre: Array) -> Array:

@@ -1,6 +1,7 @@
 """The shadows of all lights of a scene."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -12,9 +13,10 @@ from diffrast._device import over_views
 from diffrast._stored import looked_up, stored
 from diffrast._topology import Edges
 from diffrast.geometry import Geometry, Points, positions_at
-from diffrast.light import Light, ShiningLight, casts_shadow
+from diffrast.light import DirectionalLight, Light, ShiningLight, casts_shadow
 from diffrast.linalg import dot
 from diffrast.mesh import face_normals
+from diffrast.raster.evaluate import unit_of
 from diffrast.shadows.lit import lit
 from diffrast.shadows.maps import Pictures, Plan, plan, take
 from diffrast.shadows.near import Rays
@@ -37,6 +39,7 @@ class Shadows(NamedTuple):
     turned: tuple[Bool[Array, " faces"], ...]  # whether faces turn their outside to the light
     windows: tuple[Float[Array, "sides 4"], ...]
     pictures: tuple[Pictures, ...]  # one for each resolution, in ascending order
+    geometry: Geometry  # in a unit in which products of lengths stay in range
     neighbors: Int[Array, "F 3"]  # of the faces that cast them
 
 
@@ -55,7 +58,9 @@ def cast(
         The shadows, and what `receive` tells of these points.
     """
     lights, geometry, points = lax.stop_gradient((lights, geometry, points))
-    casting = [light for light in lights if casts_shadow(light)]
+    unit = unit_of(geometry.positions)
+    geometry = geometry._replace(positions=geometry.positions / unit)
+    casting = [_in_unit(unit, light) for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
         views = [light_view(light, geometry.positions) for light in casting]
         turned = [_turned_to(*both, geometry) for both in zip(casting, views, strict=True)]
@@ -72,14 +77,15 @@ def cast(
             joined = zip(*(plans[i] for i in members), strict=True)
             together = Plan(*(jnp.concatenate(column) for column in joined))
             pictures.append(take(together, geometry, size))
-        shadows = Shadows(tuple(views), tuple(turned), windows, tuple(pictures), neighbors)
-        return shadows, _reached(lights, shadows, geometry, points, regards)
+        shadows = Shadows(
+            tuple(views), tuple(turned), windows, tuple(pictures), geometry, neighbors
+        )
+        return shadows, _reached(lights, shadows, points, regards)
 
 
 def receive(
     lights: tuple[Light, ...],
     shadows: Shadows,
-    geometry: Geometry,
     points: Points,
     told: Int[Array, "lights *size"] | None = None,
 ) -> Reached:
@@ -89,27 +95,27 @@ def receive(
     shadow is near. What is `told` of the lights with shadows, 1 or 0, is not asked again; -1 where
     it is not known.
     """
-    lights, geometry, points = lax.stop_gradient((lights, geometry, points))
+    lights, points = lax.stop_gradient((lights, points))
     casting = [light for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
-        regards = _regards(casting, shadows.views, shadows.turned, geometry, points)
+        regards = _regards(casting, shadows.views, shadows.turned, shadows.geometry, points)
         if told is None:
-            return _reached(lights, shadows, geometry, points, regards)
+            return _reached(lights, shadows, points, regards)
         asked = [
             regard._replace(asked=regard.asked & (known < 0))
             for regard, known in zip(regards, told, strict=True)
         ]
-        reached = _reached(lights, shadows, geometry, points, asked)
+        reached = _reached(lights, shadows, points, asked)
         known = iter(jnp.maximum(told, 0))
         return tuple(part if part is None else part + next(known) for part in reached)
 
 
 def shone_on(
-    lights: tuple[Light, ...], shadows: Shadows, geometry: Geometry, points: Points
+    lights: tuple[Light, ...], shadows: Shadows, points: Points
 ) -> Bool[Array, "lights *size"]:
     """Whether lights with shadows would reach points if nothing were in between."""
     casting = [light for light in lights if casts_shadow(light)]
-    regards = _regards(casting, shadows.views, shadows.turned, geometry, points)
+    regards = _regards(casting, shadows.views, shadows.turned, shadows.geometry, points)
     return jnp.stack([asked for _, asked in regards])
 
 
@@ -135,7 +141,7 @@ def _regards(
     geometry: Geometry,
     points: Points,
 ) -> list[_Regard]:
-    position = stored(positions_at(geometry, points))
+    position = stored(positions_at(geometry, points._replace(position=None)))
     visible = jnp.maximum(points.face, 0)
     regards = []
     for light, view, outside in zip(lights, views, turned, strict=True):
@@ -143,6 +149,12 @@ def _regards(
         seen = stored(see(light, view, position), position[0])
         regards.append(_Regard(seen, seen.inside & outside[visible] & (points.face >= 0)))
     return regards
+
+
+def _in_unit(unit: Float[Array, ""], light: ShiningLight) -> ShiningLight:
+    if isinstance(light, DirectionalLight):
+        return light
+    return replace(light, position=light.position / unit)
 
 
 def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool[Array, " faces"]:
@@ -160,7 +172,6 @@ def _turned_to(light: ShiningLight, view: LightView, geometry: Geometry) -> Bool
 def _reached(
     lights: tuple[Light, ...],
     shadows: Shadows,
-    geometry: Geometry,
     points: Points,
     regards: list[_Regard],
 ) -> Reached:
@@ -183,7 +194,7 @@ def _reached(
             first += sides(casting[i])
         together = zip(*parts, strict=True)
         rays = Rays(*(jnp.concatenate(column, axis=-1) for column in together))
-        own_lit = over_views(lit, face.size)(pictures, geometry, shadows.neighbors, rays)
+        own_lit = over_views(lit, face.size)(pictures, shadows.geometry, shadows.neighbors, rays)
         reached.update(zip(members, own_lit.reshape(len(members), *shape), strict=True))
     numbers = iter(range(len(casting)))
     return tuple(reached[next(numbers)] if casts_shadow(light) else None for light in lights)

@@ -66,7 +66,6 @@ class _Lamps(NamedTuple):
 def outlines(
     lights: tuple[Light, ...],
     shadows: Shadows,
-    geometry: Geometry,
     topology: Topology,
     points: Points,
     lit: Bool[Array, "lights height width"],
@@ -76,7 +75,6 @@ def outlines(
     Args:
         lights: of the scene.
         shadows: of these lights.
-        geometry: of the scene.
         topology: of its faces.
         points: what each pixel sees.
         lit: whether each of the lights with shadows reaches it.
@@ -86,7 +84,7 @@ def outlines(
         that on its right, and that below it.
     """
     casting = [light for light in lights if casts_shadow(light)]
-    geometry, points = lax.stop_gradient((geometry, points))
+    geometry, points = shadows.geometry, lax.stop_gradient(points)
     found: dict[int, Array] = {}
     with jax.named_scope("outlines"):
         for pictures, (_, members) in zip(shadows.pictures, by_resolution(casting), strict=True):
@@ -168,7 +166,7 @@ def parted(
     """Count the pairs between which `outlines` looked for edges, and those with one."""
     pixels = to_pixels(positions_clip, *points.face.shape)
     volume = facing(pixels, geometry.faces)
-    shadowed = ~lit & shone_on(lights, shadows, geometry, points)
+    shadowed = ~lit & shone_on(lights, shadows, points)
     patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
     one_surface = _side_by_side(patch, jnp.equal) & _side_by_side(lit, jnp.not_equal)
 
