@@ -181,14 +181,15 @@ def clip_mesh(mesh: Mesh, camera: Camera) -> Mesh:
     middle = np.arange(1, corners - 1)
     owner, k = np.nonzero(middle + 1 < count[:, None])
     faces = np.stack([number[owner, 0], number[owner, k + 1], number[owner, k + 2]], axis=1)
-    shares, around = cut.barycentrics[used], mesh.faces[np.nonzero(used)[0]]
+    shares, origin = cut.barycentrics[used], np.nonzero(used)[0]
+    uv_faces = mesh.faces if mesh.uv_faces is None else mesh.uv_faces
 
-    def mixed(values: Array) -> Array:
-        return jnp.sum(shares[..., None] * values[around], axis=1)
+    def mixed(values: Array, indices: Array) -> Array:
+        return jnp.sum(shares[..., None] * values[indices[origin]], axis=1)
 
     return Mesh(
-        vertices=mixed(mesh.vertices),
+        vertices=mixed(mesh.vertices, mesh.faces),
         faces=faces,
-        normals=None if mesh.normals is None else normalize(mixed(mesh.normals)),
-        uvs=None if mesh.uvs is None else mixed(mesh.uvs),
+        normals=None if mesh.normals is None else normalize(mixed(mesh.normals, mesh.faces)),
+        uvs=None if mesh.uvs is None else mixed(mesh.uvs, uv_faces),
     )

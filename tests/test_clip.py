@@ -115,6 +115,19 @@ def test_a_mesh_cut_by_a_camera_keeps_its_attributes():
         clip_mesh(dm.transform(ball, dr.linalg.translation((9, 0, 0))), camera)
 
 
+def test_a_mesh_that_is_cut_keeps_uvs_with_their_own_indices():
+    # Of (x, y) in a square they are ((x + 1)/2, (y + 1)/2), in any order, and one twice.
+    square = dm.Mesh(
+        vertices=[(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)],
+        faces=[(0, 1, 2), (0, 2, 3)],
+        uvs=[(0.0, 1.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.0), (0.0, 0.0)],
+        uv_faces=[(2, 3, 1), (4, 1, 0)],
+    )
+    camera = dr.Camera.orthographic(eye=(0.3, 0, 5), target=(0.3, 0, 0), height=2, near=0, far=10)
+    part = clip_mesh(square, camera)
+    np.testing.assert_allclose(part.uvs, (part.vertices[:, :2] + 1) / 2, atol=1e-6)
+
+
 # --------------------------------------------------------------------------- barycentric (V1)
 
 
