@@ -123,6 +123,21 @@ def test_fractals_have_a_copy_at_every_corner(solid, corners, scale):
     assert shapes.fractal(one, 0, scale).faces.shape == one.faces.shape
 
 
+@pytest.mark.parametrize("spare", [0, 3])
+def test_fractals_keep_uvs_with_their_own_indices(spare):
+    uvs = np.concatenate([[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)], np.ones((spare, 2))])
+    solid = shapes.tetrahedron(flat=False)
+    own = dm.Mesh(
+        vertices=solid.vertices,
+        faces=solid.faces,
+        uvs=uvs,
+        uv_faces=[(0, 1, 2), (1, 2, 3), (2, 3, 0), (3, 1, 0)],
+    )
+    mesh = shapes.fractal(own, 2, 2.0)
+    want = np.tile(uvs[np.asarray(own.uv_faces)], (16, 1, 1))
+    np.testing.assert_array_equal(mesh.uvs[mesh.uv_faces], want)
+
+
 def test_fractals_are_differentiable_in_their_scale():
     cube = shapes.cube(flat=False)
     slope = jax.jacfwd(lambda scale: shapes.fractal(cube, 1, scale).vertices)(2.5)

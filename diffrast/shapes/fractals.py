@@ -62,7 +62,8 @@ def fractal(mesh: Mesh, iterations: int, scale: ArrayLike = 3.0) -> Mesh:
         vertices=(centres[:, None] + size * vertices).reshape(-1, 3),
         faces=faces.reshape(-1, 3),
         normals=repeated(mesh.normals),
-        uvs=repeated(mesh.uvs),
+        uvs=repeated(mesh.uvs) if mesh.uv_faces is None else mesh.uvs,  # those of all copies
+        uv_faces=repeated(mesh.uv_faces),
     )
 
 
