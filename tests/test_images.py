@@ -123,6 +123,13 @@ def test_animations(tmp_path):
             np.testing.assert_allclose(decoded(frame), images[index], atol=0.01)
 
 
+def test_the_slowest_animation(tmp_path):
+    images = RNG.uniform(size=(2, 4, 5, 3))
+    save_animation(tmp_path / "a.gif", images, frames_per_second=1 / 655.35)
+    with Image.open(tmp_path / "a.gif") as file:
+        assert file.info["duration"] == 655350
+
+
 BROKEN = {
     "empty.png": b"",
     "text.png": b"not an image",
@@ -178,6 +185,12 @@ def test_what_cannot_be_saved(tmp_path, image, name, message):
         ([np.full((2, 2, 3), np.nan)], {}, r"images\[0\]: wanted finite"),
         ([np.zeros((2, 2, 3))], {"frames_per_second": 0.0}, "frames_per_second: wanted"),
         ([np.zeros((2, 2, 3))], {"frames_per_second": 200.0}, "frames_per_second: wanted at most"),
+        (
+            [np.zeros((2, 2, 3))],
+            {"frames_per_second": 0.001},
+            r"wanted at least 0\.001526, no picture for more than 655\.35 s, got 0\.001",
+        ),
+        ([np.zeros((2, 2, 3))] * 66, {"frames_per_second": 0.1}, "at least 0.1007, .* 66 equal"),
         ([np.zeros((2, 2, 3))], {"name": "a.png"}, r"path: wanted a name that ends in \.gif"),
     ],
 )

@@ -1,6 +1,7 @@
 """Images in and out, through Pillow: linear RGB here, sRGB in the file."""
 
 from collections.abc import Iterable
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from PIL import Image, ImageFile, ImageOps
 
 from diffrast._check import ArrayInput, file_path, flag, float_array, iterable, real_number
 from diffrast.color import linear_to_srgb, srgb_to_linear
+
+_LONGEST = 0xFFFF  # time of a GIF's frame, in 1/100 s
 
 
 def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height width channels"]:
@@ -78,7 +81,8 @@ def save_animation(
     Args:
         path: the file, ending in .gif; its folder must exist.
         images: equal in size, each as for `save_image`.
-        frames_per_second: at most 100. GIF rounds the time of a frame to 1/100 s.
+        frames_per_second: at most 100. GIF rounds the time of a frame to 1/100 s, and 655.35 s is
+            its longest; equal images in a row are one frame.
         srgb: as for `save_image`.
 
     Raises:
@@ -101,7 +105,14 @@ def save_animation(
             )
     if not frames:
         raise ValueError("images: wanted at least one, got none")
-    duration = 10 * round(100 / rate)  # in milliseconds
+    time = round(100 / rate)
+    equal = max(sum(1 for _ in run) for _, run in groupby(frames, key=np.ndarray.tobytes))
+    if equal * time > _LONGEST:
+        raise ValueError(
+            f"frames_per_second: wanted at least {100 * equal / _LONGEST:.4g}, no picture for more"
+            f" than {_LONGEST / 100:g} s, got {rate:g} and {equal} equal images in a row"
+        )
+    duration = 10 * time  # in milliseconds
     _write(path, [Image.fromarray(f) for f in frames], save_all=True, duration=duration, loop=0)
 
 
