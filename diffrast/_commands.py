@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from diffrast import fit, linalg, shapes
+from diffrast._tokens import read_text
 from diffrast.camera import Camera, stack_cameras
 from diffrast.color import linear_to_srgb
 from diffrast.files import (
@@ -243,7 +244,7 @@ def is_scene_file(file: str) -> bool:
     path = Path(file)
     if path.suffix.lower() != ".dat" or not path.is_file():
         return False
-    first = path.read_text(encoding="latin-1").partition("\n")[0].split()[:3]
+    first = read_text(path).partition("\n")[0].split()[:3]
     return not (len(first) == 3 and all(word.isdigit() for word in first))
 
 

@@ -1,8 +1,24 @@
 """Words of a text file, each with its line, for errors that say where."""
 
+import codecs
 import re
+from pathlib import Path
 
 _COMMENT = re.compile(r"\{[^{}]*(\}|\Z)")
+
+
+def decoded(content: bytes) -> str:
+    """Text in UTF-8, a byte order mark or not; else in any encoding that has ASCII's numbers."""
+    content = content.removeprefix(codecs.BOM_UTF8)
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def read_text(path: Path) -> str:
+    """Text of a file, as `decoded`, each line ending in a line feed."""
+    return re.sub(r"\r\n?", "\n", decoded(path.read_bytes()))
 
 
 class Tokens:

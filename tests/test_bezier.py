@@ -284,6 +284,13 @@ def test_broken_patch_files_name_the_line(tmp_path, change, line, message):
         load_bezier(path)
 
 
+def test_patch_files_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "patch.bez"
+    path.write_bytes(b"\xef\xbb\xbf" + (DATA / "patch.bez").read_bytes() + b"{\xc4}")
+    whole = load_bezier(DATA / "patch.bez")
+    np.testing.assert_array_equal(load_bezier(path).control_points, whole.control_points)
+
+
 def test_comments_may_span_lines():
     broken_over_lines = PATCH.replace("number of", "number\nof")
     assert parse_bezier(broken_over_lines).indices.shape == (1, 4, 4)

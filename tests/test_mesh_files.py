@@ -136,6 +136,34 @@ def test_obj_attributes_of_some_faces_only_are_left_out(tmp_path):
     assert read.normals is not None
 
 
+def test_text_may_begin_with_a_byte_order_mark(tmp_path):
+    write(tmp_path / "m.mtl", "\ufeffnewmtl one\nKd .8 .7 .6\n")
+    obj = QUAD.replace("\n", "\r") + "mtllib m.mtl\rusemtl one\rf 1 2 3\r"
+    off = "OFF\n3 1 0\n0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
+    stl = f"solid\n{FACET}vertex 1 1 0\nendloop\nendfacet\nendsolid\n"
+    ply = PLY + "0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
+    for suffix, text in ((".obj", obj), (".off", off), (".stl", stl), (".ply", ply)):
+        for mark in ("", "\ufeff"):
+            path = tmp_path / f"a{suffix}"
+            path.write_bytes((mark + text).encode())
+            (part,) = load_mesh_parts(path)
+            np.testing.assert_array_equal(corners(part.mesh), [[[0, 0, 0], [1, 0, 0], [1, 1, 0]]])
+            if suffix == ".obj":
+                np.testing.assert_allclose(part.diffuse, [0.8, 0.7, 0.6], rtol=1e-6)
+    path = tmp_path / "a.obj"
+    path.write_bytes(b"\xef\xbb\xbf" + obj.encode() + b"# \xc4")  # and letters in another encoding
+    assert load_mesh(path).faces.shape == (1, 3)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_names_in_a_file_may_have_any_letters(tmp_path, encoding):
+    (tmp_path / "à.mtl").write_text("newmtl é\nKd 0 0 1\n", encoding=encoding)
+    path = tmp_path / "a.obj"
+    path.write_text(f"mtllib à.mtl\n{QUAD}usemtl é\nf 1 2 3\n", encoding=encoding)
+    (part,) = load_mesh_parts(path)
+    np.testing.assert_array_equal(part.diffuse, [0, 0, 1])
+
+
 def test_materials_and_textures(tmp_path):
     Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8)).save(tmp_path / "t.png")
     write(

@@ -121,6 +121,27 @@ def test_a_scene_is_seen_as_its_program_sees_it():
     assert lengths.min() == 4
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_files_in_any_encoding_of_their_letters(tmp_path, encoding):
+    house = (DATA / "house.dat").read_text(encoding="latin-1") + "{à}"
+    (tmp_path / "à.dat").write_text(house, encoding=encoding)
+    scene = (DATA / "scene1.dat").read_text(encoding="latin-1").replace("house.dat", "à.dat")
+    (tmp_path / "scene.dat").write_text(scene, encoding=encoding)
+    (name,) = {item.name for item in load_scene_file(tmp_path / "scene.dat").objects} - {
+        "patch.dat"
+    }
+    assert name == "à.dat"
+    read = load_polygons(tmp_path / name)
+    np.testing.assert_array_equal(read.points, load_polygons(DATA / "house.dat").points)
+
+
+def test_names_of_any_letters_are_written(tmp_path):
+    scene = load_scene_file(DATA / "scene1.dat")
+    scene = dataclasses.replace(scene, objects=(PlacedFile("Ã\u20ac.dat"), PlacedFile("Ω.dat")))
+    save_scene_file(tmp_path / "scene.dat", scene)
+    assert load_scene_file(tmp_path / "scene.dat") == scene
+
+
 def test_a_scene_renders_in_all_its_operations(tmp_path):
     scene = dataclasses.replace(load_scene_file(DATA / "scene1.dat"), raster_height=40)
     for name in ("house.dat", "patch.dat"):

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from diffrast._tokens import decoded
+
 
 def inside(folder: Path, name: str) -> Path | None:
     """The file that a name means in a folder; None if that lies elsewhere, links followed."""
@@ -16,7 +18,8 @@ def inside(folder: Path, name: str) -> Path | None:
 class Neighbors:
     """The files next to a mesh file, as trimesh asks for them.
 
-    A path from another machine falls back to the file of its name in the folder.
+    A path from another machine falls back to the file of its name in the folder. Material files
+    (.mtl) come as UTF-8, as mesh files do.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,7 +36,8 @@ class Neighbors:
         for candidate in (name, name.lstrip("/"), Path(name).name):
             path = inside(self._folder, candidate)
             if path is not None and path.is_file():
-                return path.read_bytes()
+                content = path.read_bytes()
+                return decoded(content).encode() if path.suffix.lower() == ".mtl" else content
         raise FileNotFoundError(f"{name!r} is not in {self._folder}")
 
     __getitem__ = get

@@ -10,17 +10,19 @@ import re
 from collections.abc import Iterator
 from itertools import pairwise
 
+from diffrast._tokens import decoded
+
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
 _WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
 _END_OF_LINE = re.compile(r"\r\n|\r|\n")  # not those that `str.splitlines` finds in letters
 
 
 def text_of(content: bytes, name: str) -> str:
-    """Text in any encoding that has ASCII's numbers, as comments and names may be in."""
+    """Text of a file; in UTF-8, or in any encoding that has ASCII's numbers."""
     if b"\0" in content:
         line = content[: content.index(b"\0")].count(b"\n") + 1
         raise ValueError(f"{name}:{line}: wanted text, got binary data")
-    return content.decode("latin-1")
+    return decoded(content)
 
 
 def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
@@ -254,7 +256,7 @@ def _count(word: str) -> int:
 
 def _is_finite(word: str) -> bool:
     try:
-        return math.isfinite(float(word)) and "_" not in word
+        return math.isfinite(float(word)) and word.isascii() and "_" not in word
     except ValueError:
         return False
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from diffrast._check import file_path, instance_of
+from diffrast._tokens import read_text
 from diffrast.shapes.bezier import BezierPatches, parse_bezier
 
 
@@ -19,8 +20,7 @@ def load_bezier(path: str | Path) -> BezierPatches:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    # Comments may hold letters of any encoding; the numbers are ASCII.
-    return parse_bezier(file_path("path", path).read_text(encoding="latin-1"), str(path))
+    return parse_bezier(read_text(file_path("path", path)), str(path))
 
 
 def save_bezier(path: str | Path, patches: BezierPatches) -> None:

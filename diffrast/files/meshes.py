@@ -169,7 +169,9 @@ def _checked(
         options = {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
         return header + end + body, options
     elif suffix == ".stl" and len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
-        check_ascii_stl(text_of(content, name), name)
+        text = text_of(content, name)
+        check_ascii_stl(text, name)
+        return text.encode(), {}
     return content, {}
 
 

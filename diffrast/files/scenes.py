@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from diffrast._check import file_path, instance_of
-from diffrast._tokens import Tokens
+from diffrast._tokens import Tokens, read_text
 from diffrast.mesh import Mesh, from_polygons
 
 OPERATIONS = ("wireframe", "normals", "phong", "gouraud")
@@ -85,8 +85,7 @@ def load_polygons(path: str | Path) -> Polygons:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    # Comments may hold letters of any encoding; the numbers are ASCII.
-    tokens = Tokens(file_path("path", path).read_text(encoding="latin-1"), str(path))
+    tokens = Tokens(read_text(file_path("path", path)), str(path))
     count = tokens.integer("the number of points", 1)
     polygon_count = tokens.integer("the number of polygons", 1)
     surface_count = tokens.integer("the number of surfaces", 1, 1 << 31)
@@ -140,7 +139,7 @@ def load_scene_file(path: str | Path) -> SceneFile:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    lines = _Lines(file_path("path", path).read_text(encoding="latin-1"), str(path))
+    lines = _Lines(read_text(file_path("path", path)), str(path))
     projection = PROJECTIONS[lines.choice("the type of projection", len(PROJECTIONS))]
     view_plane_distance = lines.numbers("the view plane's distance (VPD)", 1)[0]
     projection_distance = lines.numbers("the distance of the centre of projection (PRP)", 1)[0]
@@ -216,7 +215,7 @@ def save_scene_file(path: str | Path, scene: SceneFile) -> None:
         for name in ("scale", "rotation", "translation"):
             lines.append(row(*getattr(item, name), comment=name))
         lines.append(item.name)
-    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="latin-1")
+    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 class _Lines:
