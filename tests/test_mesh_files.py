@@ -462,6 +462,45 @@ def test_text_forms_of_ply_off_and_stl(tmp_path):
     assert stl.normals is None
 
 
+def test_off_polygons_become_fans_in_their_order(tmp_path):
+    points = "0 0 0\n2 0 0\n3 1 0\n2 2 0\n0 2 0\n-1 1 0\n"
+    path = tmp_path / "a.off"
+    read = load_mesh(write(path, f"OFF\n6 3 0\n{points}6 0 1 2 3 4 5\n3 5 0 4\n5 0 1 2 3 4 9 9\n"))
+    fan = [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
+    np.testing.assert_array_equal(read.faces, [*fan, [0, 4, 5], [5, 0, 4], *fan])
+    read = load_mesh(write(path, f"OFF 6 2 0\n{points}4 0 1 2 3\n4 0 3 4 5\n"))
+    np.testing.assert_array_equal(read.faces, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+
+
+def test_off_vertices_have_what_their_header_says(tmp_path):
+    path = tmp_path / "a.off"
+    place = [[0, 0, 1], [1, 0, 1], [0, 1, 1]]
+    uvs = [[0.0, 0.0], [0.5, 0.0], [0.0, 0.25]]
+
+    def read(kind, *columns):
+        rows = [" ".join(map(str, np.concatenate(row))) for row in zip(*columns, strict=True)]
+        return load_mesh(write(path, "\n".join([kind, "3 1 0", *rows, "3 0 1 2"])))
+
+    normals, color = [[0, 0, 2]] * 3, [[255, 0, 9]] * 3
+    weighted = [[0, 0, 2, 2], [-3, 0, -3, -3], [0, 0.5, 0.5, 0.5]]
+    for kind, columns in (
+        ("OFF", [place]),
+        ("COFF", [place, color]),
+        ("NOFF", [place, normals]),
+        ("4OFF", [weighted]),
+        ("STOFF", [place, uvs]),
+        ("STCOFF", [place, color, uvs]),
+        ("STCN4OFF", [weighted, normals, [[0.1, 0.2, 0.3, 1]] * 3, uvs]),
+    ):
+        mesh = read(kind, *columns)
+        np.testing.assert_array_equal(mesh.vertices, place, err_msg=kind)
+        assert (mesh.normals is not None, mesh.uvs is not None) == ("N" in kind, "ST" in kind)
+        if mesh.normals is not None:
+            np.testing.assert_array_equal(mesh.normals, [[0, 0, 1]] * 3)
+        if mesh.uvs is not None:
+            np.testing.assert_array_equal(mesh.uvs, uvs)
+
+
 # ---------------------------------------------------------------------------------------- errors
 
 PLY = (
@@ -492,6 +531,16 @@ FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n"
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0\n0 0 0\n3 0 1 2", "a.off:4: wanted three numbers"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n", "a.off:5: wanted face 0, got the end"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3", r"a.off:6: .* in \[0, 3\), got"),
+        ("a.off", "nOFF\n4\n1 0 0\n0 0 0 0\n", "a.off:1: wanted the word OFF, with ST, C, N or 4"),
+        ("a.off", "4OFF\n1 0 0\n0 0 1 0\n", "a.off:3: wanted a fourth number other than 0, got"),
+        ("a.off", "NOFF\n1 0 0\n0 0 1\n", "a.off:3: wanted 6 numbers, got '0 0 1'"),
+        ("a.off", "STCOFF\n1 0 0\n0 0 1 9 9 0 0\n", "a.off:3: .* 5 numbers and 3 or 4 of a colour"),
+        (
+            "a.off",
+            "OFF\n1 1 0\n1e39 0 0\n3 0 0 0\n",
+            "a.off: cannot be read as OFF .vertices: wanted",
+        ),
+        ("a.off", "OFF\n1 0 0\n0 0 0\n", "a.off: wanted a mesh with faces"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n", "a.ply:11: wanted vertex 2, got the end"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n0 1\n3 0 1 2\n", "a.ply:12: wanted 3 numbers for vertex 2"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", r"a.ply:13: .* in \[0, 3\)"),

@@ -1,19 +1,25 @@
 """What the mesh reader passes over in silence: the lines of text formats, checked one by one.
 
 trimesh counts OBJ's relative indices from the end of the file instead of from the face, takes the
-first vertex for index 0, accepts OFF and PLY files that end early, and does not say where a file
-is broken. Each check here raises `ValueError` "file:line: wanted ..., got ...".
+first vertex for index 0, accepts PLY files that end early, and does not say where a file is broken.
+Of OFF files, read here, it reorders polygons, and drops normals and texture coordinates. Each check
+here raises `ValueError` "file:line: wanted ..., got ...".
 """
 
 import math
 import re
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
 
 from diffrast._tokens import decoded
 
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
 _WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
+_OFF = re.compile(r"(?P<uv>ST)?(?P<color>C)?(?P<normal>N)?(?P<weight>4)?OFF")
 _END_OF_LINE = re.compile(r"\r\n|\r|\n")  # not those that `str.splitlines` finds in letters
 
 
@@ -123,11 +129,28 @@ def _obj_corner(corner: list[int], kind: tuple[bool, bool]) -> str:
     return f"{corner[0]}/{corner[1]}" if has_uv else f"{corner[0]}"
 
 
-def check_off(text: str, name: str) -> None:
-    """Check that an OFF file has the vertices and faces that it announces."""
+class OffMesh(NamedTuple):
+    """What an OFF file says; None for what it does not. Normals are of any length."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    normals: Float[np.ndarray, "vertices 3"] | None
+    uvs: Float[np.ndarray, "vertices 2"] | None
+
+
+def read_off(text: str, name: str) -> OffMesh:
+    """An OFF file, checked; its polygons as fans, in their places.
+
+    A vertex has a position (4OFF: and what to divide it by), with N a normal, with C a colour of 3
+    or 4 numbers, with ST texture coordinates, in this order. Colours are dropped.
+    """
     lines = [(n, w) for n, w in _numbered(text) if w]
-    if not lines or not lines[0][1][0].endswith("OFF"):
-        raise ValueError(f"{name}:1: wanted the word OFF, got {_quote(text.split()[:1])}")
+    kind = _OFF.fullmatch(lines[0][1][0]) if lines else None
+    if kind is None:
+        raise ValueError(
+            f"{name}:1: wanted the word OFF, with ST, C, N or 4 before it or not, got"
+            f" {_quote(text.split()[:1])}"
+        )
     number, words = lines[0]
     rest = lines[1:] if len(words) == 1 else [(number, words[1:]), *lines[1:]]
     if not rest:
@@ -138,15 +161,49 @@ def check_off(text: str, name: str) -> None:
         raise ValueError(
             f"{name}:{number}: wanted the numbers of vertices and faces, got {_quote(words)}"
         )
-    vertices, faces = sizes
     body = iter(rest[1:])
-    for k in range(vertices):
+    # Lists grow with what is read: the numbers above may be any.
+    vertices: list[list[float]] = []
+    for k in range(sizes[0]):
         number, words = _next_line(body, f"vertex {k}", name, number)
-        if len(words) < 3 or not all(_is_finite(word) for word in words[:3]):
-            raise ValueError(f"{name}:{number}: wanted three numbers, got {_quote(words)}")
-    for k in range(faces):
+        vertices.append(_off_vertex(words, kind, f"{name}:{number}"))
+    faces: list[list[int]] = []
+    for k in range(sizes[1]):
         number, words = _next_line(body, f"face {k}", name, number)
-        _check_indices(words, vertices, f"{name}:{number}")
+        _check_indices(words, len(vertices), f"{name}:{number}")
+        first, *others = map(int, words[1 : 1 + int(words[0])])
+        faces += [[first, b, c] for b, c in pairwise(others)]
+    values = np.array(vertices).reshape(len(vertices), -1)
+    return OffMesh(
+        vertices=values[:, :3],
+        faces=np.array(faces, dtype=int).reshape(-1, 3),
+        normals=values[:, 3:6] if kind["normal"] else None,
+        uvs=values[:, -2:] if kind["uv"] else None,
+    )
+
+
+def _off_vertex(words: list[str], kind: re.Match[str], where: str) -> list[float]:
+    """Position, normal and texture coordinates, as far as there are any."""
+    size = 4 if kind["weight"] else 3
+    size += 3 if kind["normal"] else 0
+    color = len(words) - size - 2 if kind["color"] and kind["uv"] else 0
+    used = words[:size] + (words[size + color : size + color + 2] if kind["uv"] else [])
+    wanted = size + (2 if kind["uv"] else 0)
+    if len(used) < wanted or not all(_is_finite(word) for word in used):
+        raise ValueError(
+            f"{where}: wanted {'three' if wanted == 3 else wanted} numbers, got {_quote(words)}"
+        )
+    if kind["color"] and kind["uv"] and color not in (3, 4):
+        raise ValueError(
+            f"{where}: wanted {wanted} numbers and 3 or 4 of a colour, got {_quote(words)}"
+        )
+    numbers = [float(word) for word in used]
+    if kind["weight"]:
+        weight = numbers.pop(3)
+        if weight == 0:
+            raise ValueError(f"{where}: wanted a fourth number other than 0, got {_quote(words)}")
+        numbers[:3] = [x / weight for x in numbers[:3]]
+    return numbers
 
 
 def check_ply(content: bytes, name: str) -> None:

@@ -2,9 +2,10 @@
 
 Reading goes through trimesh, an optional dependency (`pip install diffrast[mesh]`), told to
 change nothing: no merging, no reordering, no guessing of normals. `diffrast.files._mesh_text`
-checks text formats first.
+checks text formats first, and reads OFF.
 """
 
+import dataclasses
 import io
 import logging
 import re
@@ -25,9 +26,9 @@ from diffrast.files import _gltf
 from diffrast.files._folder import Neighbors
 from diffrast.files._mesh_text import (
     check_ascii_stl,
-    check_off,
     check_ply,
     plain_obj,
+    read_off,
     text_of,
 )
 from diffrast.files.images import check_picture
@@ -67,7 +68,7 @@ def load_mesh(path: str | Path) -> Mesh:
         path: the file; its suffix names the format.
 
     Raises:
-        ImportError: when trimesh is not installed.
+        ImportError: when trimesh is not installed (all but OFF).
         ValueError: with the file's name, and the line in text formats, for an unknown suffix, a
             broken file, or a file without faces.
         OSError: when the file cannot be opened.
@@ -124,6 +125,8 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
 def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
     suffix = _known_suffix(path)
     content = path.read_bytes()
+    if suffix == ".off":
+        return [MeshPart("geometry_0", _off_mesh(content, path))]
     with _quiet_trimesh() as trimesh:
         content, options = _checked(content, suffix, path, materials)
         try:
@@ -159,9 +162,7 @@ def _checked(
         # Keeping the order is right only where there is nothing to split vertices for.
         plain = "/" not in text.partition("\nf ")[2]
         return text.encode(), {"maintain_order": plain, "skip_materials": not materials}
-    if suffix == ".off":
-        check_off(text_of(content, name), name)
-    elif suffix == ".ply":
+    if suffix == ".ply":
         check_ply(content, name)
         header, end, body = content.partition(b"end_header")
         # trimesh makes paths of edges, in memory that grows with the largest index, and no faces.
@@ -173,6 +174,19 @@ def _checked(
         check_ascii_stl(text, name)
         return text.encode(), {}
     return content, {}
+
+
+def _off_mesh(content: bytes, path: Path) -> Mesh:
+    read = read_off(text_of(content, str(path)), str(path))
+    if len(read.faces) == 0:
+        raise ValueError(f"{path}: wanted a mesh with faces, got none")
+    try:
+        mesh = Mesh(**read._asdict())
+    except ValueError as error:  # numbers beyond 32 bits
+        raise ValueError(f"{path}: cannot be read as OFF ({error})") from error
+    if mesh.normals is None:
+        return mesh
+    return dataclasses.replace(mesh, normals=normalize(mesh.normals))
 
 
 def _scene_parts(
