@@ -566,6 +566,16 @@ def test_broken_files_are_named_with_their_line(tmp_path, file, text, message):
         load_mesh(write(tmp_path / file, text))
 
 
+@pytest.mark.parametrize(("change", "size"), [(lambda b: b[:-5], 179), (lambda b: b + b"xx", 186)])
+def test_binary_stl_of_another_length_than_it_announces(tmp_path, change, size):
+    path = tmp_path / "a.stl"
+    save_mesh(path, shapes.plane())
+    path.write_bytes(change(path.read_bytes()))
+    message = f"a.stl: wanted 184 bytes, for a header that announces 2 triangles, got {size}"
+    with pytest.raises(ValueError, match=message):
+        load_mesh(path)
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_truncated_and_random_files_are_value_errors(tmp_path, suffix):
     whole = tmp_path / f"whole{suffix}"

@@ -169,11 +169,20 @@ def _checked(
         header = re.sub(rb"element\s+edge\b", b"element lines", header)
         options = {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
         return header + end + body, options
-    elif suffix == ".stl" and len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
+    elif suffix == ".stl" and len(content) != (wanted := _size_of_binary_stl(content)):
+        if b"\0" in content:
+            raise ValueError(
+                f"{path}: wanted {wanted} bytes, for a header that announces {(wanted - 84) // 50}"
+                f" triangles, got {len(content)}"
+            )
         text = text_of(content, name)
         check_ascii_stl(text, name)
         return text.encode(), {}
     return content, {}
+
+
+def _size_of_binary_stl(content: bytes) -> int:
+    return 84 + 50 * int.from_bytes(content[80:84], "little")
 
 
 def _off_mesh(content: bytes, path: Path) -> Mesh:
