@@ -429,6 +429,7 @@ HOSTILE = {
     "corners.ply": PLY.replace("\n3 0 1 2", f"\n{MANY} 0 1 2").encode(),
     "digits.ply": PLY.replace("vertex 4", "vertex " + "9" * 5000).encode(),
     "binary.ply": PLY_HEADER.format("int").replace("vertex 3", f"vertex {MANY}").encode() + BODY,
+    "most.ply": PLY_HEADER.format("int").replace("vertex 3", "vertex " + "9" * 18).encode() + BODY,
     "negative.ply": PLY_HEADER.format("int").replace("vertex 3", "vertex -3").encode() + BODY,
     "length.ply": PLY_HEADER.format("int").replace("uchar", "uint").encode() + BODY + b"\xff" * 16,
     "index.ply": PLY_HEADER.format("uint").encode() + BODY + b"\x03" + b"\xff" * 12,

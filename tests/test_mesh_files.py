@@ -1,8 +1,10 @@
 import base64
 import builtins
 import dataclasses
+import itertools
 import json
 import logging
+import struct
 import sys
 from pathlib import Path
 
@@ -499,6 +501,86 @@ def test_off_vertices_have_what_their_header_says(tmp_path):
             np.testing.assert_array_equal(mesh.normals, [[0, 0, 1]] * 3)
         if mesh.uvs is not None:
             np.testing.assert_array_equal(mesh.uvs, uvs)
+
+
+def binary_ply(faces, *, order="<", uvs=False):
+    """Nine points; faces with a scalar before their corners, and edges behind them."""
+    kind = "little" if order == "<" else "big"
+    texcoord = "property list ushort double texcoord\n" if uvs else ""
+    header = (
+        f"ply\nformat binary_{kind}_endian 1.0\ncomment end_header soon\nelement vertex 9\n"
+        f"property double x\nproperty double y\nproperty double z\nelement face {len(faces)}\n"
+        f"property uchar red\nproperty list int ushort vertex_index\n{texcoord}"
+        "element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    )
+    content = np.arange(27).astype(f"{order}f8").tobytes()
+    for face in faces:
+        content += struct.pack(f"{order}Bi{len(face)}H", 7, len(face), *face)
+        if uvs:
+            numbers = [(vertex + axis) / 8 for vertex in face for axis in (0, 1)]
+            content += struct.pack(f"{order}H{len(numbers)}d", len(numbers), *numbers)
+    return header.encode() + content + struct.pack(f"{order}ii", 0, 1)
+
+
+POLYGONS = {  # trimesh takes sizes from the first: of (4, 3, 5) their sum is right
+    "triangles": [(0, 1, 2), (5, 4, 3)],
+    "quads": [(0, 1, 2, 3), (8, 7, 6, 5)],
+    "mixed": [(0, 1, 2), (3, 4, 5, 6, 7, 8), (1, 2, 3, 4, 5), (0, 2, 1)],
+    "of one sum": [(0, 1, 2, 3), (6, 5, 4), (1, 2, 3, 4, 5)],
+}
+
+
+@pytest.mark.parametrize("uvs", [False, True])
+@pytest.mark.parametrize("polygons", POLYGONS)
+def test_ply_polygons_become_fans_in_their_order(tmp_path, polygons, uvs):
+    faces = POLYGONS[polygons]
+    fans = [(face[0], b, c) for face in faces for b, c in itertools.pairwise(face[1:])]
+    path = tmp_path / "a.ply"
+    for order in "<>":
+        path.write_bytes(binary_ply(faces, order=order, uvs=uvs))
+        read = load_mesh(path)
+        np.testing.assert_array_equal(corners(read)[..., 0], 3 * np.array(fans))
+        assert (read.uvs is not None) == uvs
+        if uvs:
+            np.testing.assert_array_equal(corners(read, "uvs")[..., 1], np.array(fans) / 8 + 1 / 8)
+    rows = [f"7 {len(face)} {' '.join(map(str, face))}" for face in faces]
+    header = PLY.replace("vertex 3", "vertex 9").replace("face 1", f"face {len(faces)}")
+    header = header.replace("property list", "property uchar red\nproperty list")
+    points = [f"{k} 0 0" for k in range(9)]
+    read = load_mesh(write(path, "\n".join([header + points[0], *points[1:], "", *rows])))
+    np.testing.assert_array_equal(read.faces, fans)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda b: b[:-9], "a.ply: wanted face 3, got the end of the file"),
+        (lambda b: b[:-1], "a.ply: cannot be read as PLY"),
+        (lambda b: b.replace(b"vertex 9", b"vertex 8"), "a.ply: wanted face|a.ply: face"),
+        (
+            lambda b: b.replace(struct.pack("<H", 8), struct.pack("<H", 9)),
+            r"face 1: .* in \[0, 9\)",
+        ),
+        (
+            lambda b: b.replace(b"vertex_index", b"vertex"),
+            "a.ply: wanted faces with a list vertex_i",
+        ),
+        (
+            lambda b: b.replace(b"list int", b"list float"),
+            "a.ply:10: wanted a type .* got 'list fl",
+        ),
+        (
+            lambda b: b.replace(b"uchar red", b"colour red"),
+            "a.ply:9: wanted a type .* got 'colour r",
+        ),
+        (lambda b: b.replace(b"double y", b"double x"), "a.ply:6: wanted properties of several na"),
+    ],
+)
+def test_broken_binary_ply(tmp_path, change, message):
+    path = tmp_path / "a.ply"
+    path.write_bytes(change(binary_ply(POLYGONS["mixed"])))
+    with pytest.raises(ValueError, match=message):
+        load_mesh(path)
 
 
 # ---------------------------------------------------------------------------------------- errors

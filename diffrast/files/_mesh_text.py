@@ -1,9 +1,9 @@
 """What the mesh reader passes over in silence: the lines of text formats, checked one by one.
 
 trimesh counts OBJ's relative indices from the end of the file instead of from the face, takes the
-first vertex for index 0, accepts PLY files that end early, and does not say where a file is broken.
-Of OFF files, read here, it reorders polygons, and drops normals and texture coordinates. Each check
-here raises `ValueError` "file:line: wanted ..., got ...".
+first vertex for index 0, and does not say where a file is broken. Of OFF files, read here, it
+reorders polygons, and drops normals and texture coordinates. Each check here raises `ValueError`
+"file:line: wanted ..., got ...".
 """
 
 import math
@@ -83,17 +83,15 @@ def _obj_numbers(words: list[str], where: str) -> list[str]:
     numbers = words[1 : 1 + size]
     if words[0] == "vt" and len(numbers) == 1:
         numbers = [*numbers, "0"]
-    if len(numbers) < size or not all(_is_finite(word) for word in numbers):
-        raise ValueError(
-            f"{where}: wanted {size} numbers after {words[0]}, got {_quote(words[1:])}"
-        )
+    if len(numbers) < size or not all(is_finite(word) for word in numbers):
+        raise ValueError(f"{where}: wanted {size} numbers after {words[0]}, got {quote(words[1:])}")
     return numbers
 
 
 def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[list[int]]:
     """Indices (v, vt, vn) of each corner, from 1; 0 where the corner has none."""
     if len(words) < 3:
-        raise ValueError(f"{where}: wanted at least 3 corners after f, got {_quote(words)}")
+        raise ValueError(f"{where}: wanted at least 3 corners after f, got {quote(words)}")
     corners = []
     for word in words:
         fields = word.split("/")
@@ -144,33 +142,33 @@ def read_off(text: str, name: str) -> OffMesh:
     A vertex has a position (4OFF: and what to divide it by), with N a normal, with C a colour of 3
     or 4 numbers, with ST texture coordinates, in this order. Colours are dropped.
     """
-    lines = [(n, w) for n, w in _numbered(text) if w]
+    lines = [(n, w) for n, w in numbered(text) if w]
     kind = _OFF.fullmatch(lines[0][1][0]) if lines else None
     if kind is None:
         raise ValueError(
             f"{name}:1: wanted the word OFF, with ST, C, N or 4 before it or not, got"
-            f" {_quote(text.split()[:1])}"
+            f" {quote(text.split()[:1])}"
         )
     number, words = lines[0]
     rest = lines[1:] if len(words) == 1 else [(number, words[1:]), *lines[1:]]
     if not rest:
         raise ValueError(f"{name}:{number}: wanted the numbers of vertices and faces, got the end")
     number, words = rest[0]
-    sizes = [_count(word) for word in words[:2]]
+    sizes = [to_count(word) for word in words[:2]]
     if len(sizes) < 2 or min(sizes) < 0:
         raise ValueError(
-            f"{name}:{number}: wanted the numbers of vertices and faces, got {_quote(words)}"
+            f"{name}:{number}: wanted the numbers of vertices and faces, got {quote(words)}"
         )
     body = iter(rest[1:])
     # Lists grow with what is read: the numbers above may be any.
     vertices: list[list[float]] = []
     for k in range(sizes[0]):
-        number, words = _next_line(body, f"vertex {k}", name, number)
+        number, words = next_line(body, f"vertex {k}", name, number)
         vertices.append(_off_vertex(words, kind, f"{name}:{number}"))
     faces: list[list[int]] = []
     for k in range(sizes[1]):
-        number, words = _next_line(body, f"face {k}", name, number)
-        _check_indices(words, len(vertices), f"{name}:{number}")
+        number, words = next_line(body, f"face {k}", name, number)
+        check_indices(words, len(vertices), f"{name}:{number}")
         first, *others = map(int, words[1 : 1 + int(words[0])])
         faces += [[first, b, c] for b, c in pairwise(others)]
     values = np.array(vertices).reshape(len(vertices), -1)
@@ -189,77 +187,32 @@ def _off_vertex(words: list[str], kind: re.Match[str], where: str) -> list[float
     color = len(words) - size - 2 if kind["color"] and kind["uv"] else 0
     used = words[:size] + (words[size + color : size + color + 2] if kind["uv"] else [])
     wanted = size + (2 if kind["uv"] else 0)
-    if len(used) < wanted or not all(_is_finite(word) for word in used):
+    if len(used) < wanted or not all(is_finite(word) for word in used):
         raise ValueError(
-            f"{where}: wanted {'three' if wanted == 3 else wanted} numbers, got {_quote(words)}"
+            f"{where}: wanted {'three' if wanted == 3 else wanted} numbers, got {quote(words)}"
         )
     if kind["color"] and kind["uv"] and color not in (3, 4):
         raise ValueError(
-            f"{where}: wanted {wanted} numbers and 3 or 4 of a colour, got {_quote(words)}"
+            f"{where}: wanted {wanted} numbers and 3 or 4 of a colour, got {quote(words)}"
         )
     numbers = [float(word) for word in used]
     if kind["weight"]:
         weight = numbers.pop(3)
         if weight == 0:
-            raise ValueError(f"{where}: wanted a fourth number other than 0, got {_quote(words)}")
+            raise ValueError(f"{where}: wanted a fourth number other than 0, got {quote(words)}")
         numbers[:3] = [x / weight for x in numbers[:3]]
     return numbers
-
-
-def check_ply(content: bytes, name: str) -> None:
-    """Check the header of a PLY file and, if it is text, the elements that the header announces."""
-    header, end, _ = content.partition(b"end_header")
-    is_text = b"ascii" in b"".join(header.splitlines()[1:2])
-    lines = _numbered(text_of(content if is_text else header + end, name))
-    elements: list[tuple[str, int, list[str]]] = []
-    number = 1
-    for number, words in lines:
-        if words[:1] == ["element"]:
-            if len(words) != 3 or _count(words[2]) < 0:
-                raise ValueError(
-                    f"{name}:{number}: wanted a name and a number after element, got"
-                    f" {_quote(words[1:])}"
-                )
-            elements.append((words[1], _count(words[2]), []))
-        elif words[:1] == ["property"] and elements:
-            elements[-1][2].append("list" if words[1:2] == ["list"] else "scalar")
-        elif words[:1] == ["end_header"]:
-            break
-    else:
-        raise ValueError(f"{name}:{number}: wanted end_header, got the end of the file")
-    if is_text:
-        _check_ply_text(lines, elements, number, name)
-
-
-def _check_ply_text(
-    lines: Iterator[tuple[int, list[str]]],
-    elements: list[tuple[str, int, list[str]]],
-    number: int,
-    name: str,
-) -> None:
-    vertices = sum(count for element, count, _ in elements if element == "vertex")
-    for element, count, properties in elements:
-        for k in range(count):
-            number, words = _next_line(lines, f"{element} {k}", name, number)
-            scalars = properties.count("scalar")
-            if len(words) < scalars or not all(_is_finite(word) for word in words):
-                raise ValueError(
-                    f"{name}:{number}: wanted {scalars or 'several'} numbers for {element} {k},"
-                    f" got {_quote(words)}"
-                )
-            if element == "face" and properties[:1] == ["list"]:
-                _check_indices(words, vertices, f"{name}:{number}")
 
 
 def check_ascii_stl(text: str, name: str) -> None:
     """Check that a text STL file has facets of three vertices, and an end."""
     corners, number, inside = 0, 1, False
-    for number, words in _numbered(text):
+    for number, words in numbered(text):
         key = words[0].lower() if words else ""
         if key == "vertex":
             corners += 1
-            if len(words) != 4 or not all(_is_finite(word) for word in words[1:]):
-                raise ValueError(f"{name}:{number}: wanted three numbers, got {_quote(words[1:])}")
+            if len(words) != 4 or not all(is_finite(word) for word in words[1:]):
+                raise ValueError(f"{name}:{number}: wanted three numbers, got {quote(words[1:])}")
         elif key in ("endloop", "endfacet", "endsolid") and corners % 3:
             raise ValueError(f"{name}:{number}: wanted facets of three vertices, got {key} early")
         elif key in ("solid", "endsolid"):
@@ -268,7 +221,7 @@ def check_ascii_stl(text: str, name: str) -> None:
         raise ValueError(f"{name}:{number}: wanted endsolid, got the end of the file")
 
 
-def _numbered(text: str) -> Iterator[tuple[int, list[str]]]:
+def numbered(text: str) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(_lines(text), start=1):
         yield number, line.split("#")[0].split()
 
@@ -278,7 +231,7 @@ def _lines(text: str) -> list[str]:
     return lines[:-1] if lines[-1] == "" else lines
 
 
-def _next_line(
+def next_line(
     lines: Iterator[tuple[int, list[str]]], wanted: str, name: str, number: int
 ) -> tuple[int, list[str]]:
     """The next line that is not empty."""
@@ -288,15 +241,15 @@ def _next_line(
     raise ValueError(f"{name}:{number}: wanted {wanted}, got the end of the file")
 
 
-def _check_indices(words: list[str], bound: int, where: str) -> None:
+def check_indices(words: list[str], bound: int, where: str) -> None:
     """A number of corners and as many vertex ids, perhaps more."""
-    size = _count(words[0])
+    size = to_count(words[0])
     ids = words[1 : 1 + size]
     fits = size >= 3 and len(ids) == size
-    if not (fits and all(0 <= _count(word) < bound for word in ids)):
+    if not (fits and all(0 <= to_count(word) < bound for word in ids)):
         raise ValueError(
             f"{where}: wanted a number of corners and as many indices in [0, {bound}), got"
-            f" {_quote(words)}"
+            f" {quote(words)}"
         )
 
 
@@ -305,19 +258,19 @@ def _whole(word: str) -> int | None:
     return int(word) if _WHOLE.fullmatch(word) else None
 
 
-def _count(word: str) -> int:
+def to_count(word: str) -> int:
     """A number of things, or an index from 0; −1 for any other word."""
     whole = _whole(word)
     return -1 if whole is None or whole < 0 else whole
 
 
-def _is_finite(word: str) -> bool:
+def is_finite(word: str) -> bool:
     try:
         return math.isfinite(float(word)) and word.isascii() and "_" not in word
     except ValueError:
         return False
 
 
-def _quote(words: list[str]) -> str:
+def quote(words: list[str]) -> str:
     text = " ".join(words)
     return repr(text if len(text) <= 60 else text[:57] + "...")

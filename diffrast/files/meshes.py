@@ -2,13 +2,12 @@
 
 Reading goes through trimesh, an optional dependency (`pip install diffrast[mesh]`), told to
 change nothing: no merging, no reordering, no guessing of normals. `diffrast.files._mesh_text`
-checks text formats first, and reads OFF.
+and `._ply` check text formats first, cut polygons into fans, and read OFF.
 """
 
 import dataclasses
 import io
 import logging
-import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,11 +25,11 @@ from diffrast.files import _gltf
 from diffrast.files._folder import Neighbors
 from diffrast.files._mesh_text import (
     check_ascii_stl,
-    check_ply,
     plain_obj,
     read_off,
     text_of,
 )
+from diffrast.files._ply import plain_ply
 from diffrast.files.images import check_picture
 from diffrast.linalg import normalize
 from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
@@ -163,12 +162,9 @@ def _checked(
         plain = "/" not in text.partition("\nf ")[2]
         return text.encode(), {"maintain_order": plain, "skip_materials": not materials}
     if suffix == ".ply":
-        check_ply(content, name)
-        header, end, body = content.partition(b"end_header")
-        # trimesh makes paths of edges, in memory that grows with the largest index, and no faces.
-        header = re.sub(rb"element\s+edge\b", b"element lines", header)
-        options = {"fix_texture": b"texcoord" in header, "skip_materials": not materials}
-        return header + end + body, options
+        content = plain_ply(content, name)
+        own_uvs = b"texcoord" in content.partition(b"end_header")[0]
+        return content, {"fix_texture": own_uvs, "skip_materials": not materials}
     elif suffix == ".stl" and len(content) != (wanted := _size_of_binary_stl(content)):
         if b"\0" in content:
             raise ValueError(
