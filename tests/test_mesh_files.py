@@ -623,6 +623,7 @@ FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n"
             "a.off: cannot be read as OFF .vertices: wanted",
         ),
         ("a.off", "OFF\n1 0 0\n0 0 0\n", "a.off: wanted a mesh with faces"),
+        ("a.off", "OFF\n0 0 0\n", "a.off: wanted a mesh with faces"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n", "a.ply:11: wanted vertex 2, got the end"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n0 1\n3 0 1 2\n", "a.ply:12: wanted 3 numbers for vertex 2"),
         ("a.ply", PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", r"a.ply:13: .* in \[0, 3\)"),

@@ -171,7 +171,8 @@ def read_off(text: str, name: str) -> OffMesh:
         check_indices(words, len(vertices), f"{name}:{number}")
         first, *others = map(int, words[1 : 1 + int(words[0])])
         faces += [[first, b, c] for b, c in pairwise(others)]
-    values = np.array(vertices).reshape(len(vertices), -1)
+    width = 3 + 3 * bool(kind["normal"]) + 2 * bool(kind["uv"])
+    values = np.array(vertices, dtype=float).reshape(-1, width)
     return OffMesh(
         vertices=values[:, :3],
         faces=np.array(faces, dtype=int).reshape(-1, 3),
