@@ -437,6 +437,88 @@ def test_gltf_without_a_material_keeps_its_uvs(tmp_path, suffix):
     assert part.diffuse is None
 
 
+def gltf_of(arrays, **primitive):
+    """A file of one primitive with each attribute and its indices as they are, by name."""
+    names = {"f4": 5126, "i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123}
+    tree = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    tree |= {"accessors": [], "bufferViews": [], "buffers": []}
+    for number, array in enumerate(arrays.values()):
+        data = base64.b64encode(array.tobytes()).decode()
+        uri = f"data:application/octet-stream;base64,{data}"
+        tree["buffers"].append({"uri": uri, "byteLength": array.nbytes})
+        tree["bufferViews"].append({"buffer": number, "byteLength": array.nbytes})
+        accessor = {"bufferView": number, "componentType": names[array.dtype.str[1:]]}
+        accessor |= {"count": len(array), "type": "VEC3" if array.ndim == 2 else "SCALAR"}
+        tree["accessors"].append(accessor)
+    numbers = {name: number for number, name in enumerate(arrays)}
+    primitive |= {"indices": numbers.pop("indices")} if "indices" in numbers else {}
+    tree["meshes"] = [{"primitives": [{"attributes": numbers, **primitive}]}]
+    return tree
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int16, np.uint16])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_gltf_positions_in_whole_numbers(tmp_path, suffix, kind, normalized):
+    limits = np.iinfo(kind)
+    low = limits.min if normalized else 0
+    positions = np.array([(0, 0, 0), (limits.max, 0, 1), (0, limits.max, low)], kind)
+    normals = np.array([(0, 0, 127), (127, 0, 0), (0, -128, 0)], np.int8)
+    tree = gltf_of({"POSITION": positions, "NORMAL": normals})
+    tree["extensionsUsed"] = tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    tree["accessors"][0]["normalized"] = normalized
+    tree["accessors"][1]["normalized"] = True
+    tree["nodes"][0] |= {"scale": [2, 2, 2], "translation": [0, 0, 5]}
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(as_glb(tree) if suffix == ".glb" else json.dumps(tree).encode())
+    read = load_mesh(path)
+    stored = np.maximum(positions / limits.max, -1) if normalized else positions
+    np.testing.assert_allclose(read.vertices, 2.0 * stored + (0, 0, 5), rtol=1e-6)
+    np.testing.assert_allclose(read.normals, [(0, 0, 1), (1, 0, 0), (0, -1, 0)], atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6])
+@pytest.mark.parametrize("indexed", [False, True])
+def test_gltf_strips_and_fans(tmp_path, count, indexed):
+    points = np.arange(3 * count, dtype="f4").reshape(-1, 3)
+    order = np.random.default_rng(count).permutation(count) if indexed else np.arange(count)
+    arrays = {"POSITION": points} | ({"indices": order.astype("u2")} if indexed else {})
+    tree = gltf_of(arrays, mode=6)
+    tree["meshes"][0]["primitives"].append({**tree["meshes"][0]["primitives"][0], "mode": 5})
+    fan, strip = load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))
+    np.testing.assert_array_equal(
+        fan.mesh.faces, [order[[0, k, k + 1]] for k in range(1, count - 1)]
+    )
+    ahead = [order[[k + 2, k + 1, k] if k % 2 else [k, k + 1, k + 2]] for k in range(count - 2)]
+    np.testing.assert_array_equal(strip.mesh.faces, ahead)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda t: t.update(extensionsRequired=["KHR_texture_transform", "FOO_bar"]),
+            "extensionsRequired: wanted extensions among EXT_texture_webp, .*, got 'FOO_bar'",
+        ),
+        (
+            lambda t: t.update(extensionsRequired="KHR_texture_transform"),
+            "extensionsRequired: wanted a list of names, got 'KHR",
+        ),
+        (
+            lambda t: t["meshes"][0]["primitives"][0].update(mode=7),
+            r"meshes\[0\]: wanted a mode in \[0, 7\), got 7",
+        ),
+    ],
+)
+def test_gltf_that_cannot_be_read_right_is_refused(tmp_path, change, message):
+    tree = gltf_of({"POSITION": np.eye(3, dtype="f4")})
+    path = write(tmp_path / "a.gltf", json.dumps(tree))
+    assert load_mesh(path).faces.shape == (1, 3)
+    change(tree)
+    with pytest.raises(ValueError, match=f"a.gltf: cannot be read as GLTF .{message}"):
+        load_mesh(write(path, json.dumps(tree)))
+
+
 def test_gltf_base_colour(tmp_path):
     save_mesh(tmp_path / "a.gltf", shapes.plane())
     tree = json.loads((tmp_path / "a.gltf").read_text())

@@ -1,16 +1,17 @@
-"""What the JSON of a glTF file says of textures; trimesh leaves it out.
+"""What the JSON of a glTF file says of textures and numbers; trimesh leaves it out.
 
 That is how a texture is repeated and filtered (its sampler), which of a mesh's sets of texture
 coordinates it takes, in which kind of numbers they are stored, and how they are moved first
 (KHR_texture_transform). The coordinates go through trimesh as an attribute of our own, and a
-material is known again by its name, which is made its number.
+material is known again by its name, which is made its number. Positions and normals stored as
+fractions (KHR_mesh_quantization) go through as attributes, too, and fans of triangles as strips.
 """
 
 import json
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from diffrast.files._gltf_structure import check_index, check_structure, entries
 
@@ -20,6 +21,9 @@ MAGNIFIED = (NEAREST, LINEAR)
 MINIFIED = (NEAREST, LINEAR, 9984, 9985, 9986, 9987)  # the last four look into a pyramid
 
 _PLAIN, _NORMALIZED = "_UV", "_UV_NORMALIZED"
+_FRACTIONS = {"POSITION": "_POSITION_NORMALIZED", "NORMAL": "_NORMAL_NORMALIZED"}
+_FAN = "_FAN"
+_STRIP_MODE, _FAN_MODE = 5, 6
 
 
 class TextureUse(NamedTuple):
@@ -71,6 +75,7 @@ def prepare(
                 check_index(f"{where}: material", index, uses)
             use = None if index is None else uses[index]
             _mark_coordinates(tree, primitive["attributes"], use, where, need_coordinates)
+            _mark_geometry(tree, primitive)
     text = json.dumps(tree).encode()
     if suffix == ".gltf":
         return text, uses
@@ -90,10 +95,27 @@ def coordinates_of(geometry: Any, use: TextureUse | None) -> Float[np.ndarray, "
     found = np.asarray(geometry.vertex_attributes[name])
     uvs = found.astype(np.float32)[:, :2]
     if name == _NORMALIZED:
-        uvs = np.maximum(uvs / np.iinfo(found.dtype).max, -1)
+        uvs = _fractions(found)[:, :2]
     if use is not None and use.transform is not None:
         uvs = (uvs @ use.transform[:, :2].T + use.transform[:, 2]).astype(np.float32)
     return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+
+
+def vectors_of(geometry: Any, name: str, stored: np.ndarray) -> Float[np.ndarray, "V 3"]:
+    """POSITION or NORMAL of a mesh of trimesh's, which are stored as they are, or as fractions."""
+    found = geometry.vertex_attributes.get(_FRACTIONS[name])
+    return stored if found is None else _fractions(np.asarray(found))
+
+
+def faces_of(geometry: Any) -> Int[np.ndarray, "F 3"]:
+    """Triangles of a mesh of trimesh's."""
+    faces = np.array(geometry.faces)
+    if _FAN not in geometry.vertex_attributes or len(faces) == 0:
+        return faces
+    # Of a strip a, b, c, d, ... they are abc, dcb, cde, ...; a fan's are abc, acd, ade, ...
+    second = faces[:, 1]
+    third = np.append(second[1:], faces[-1, 2 if len(faces) % 2 else 0])
+    return np.stack([np.full_like(second, faces[0, 0]), second, third], axis=1)
 
 
 def use_of(geometry: Any, uses: list[TextureUse | None]) -> TextureUse | None:
@@ -195,6 +217,24 @@ def _mark_coordinates(
         check_index(f"{where}: {name}", attributes[name], accessors)
         normalized = accessors[attributes[name]].get("normalized", False)
         attributes[_NORMALIZED if normalized else _PLAIN] = attributes[name]
+
+
+def _mark_geometry(tree: dict[str, Any], primitive: dict[str, Any]) -> None:
+    """Name what is stored as fractions as our own, and a fan that is to pass as a strip."""
+    attributes = primitive["attributes"]
+    attributes.pop(_FAN, None)
+    for name, own in _FRACTIONS.items():
+        attributes.pop(own, None)
+        if name in attributes and entries(tree, "accessors")[attributes[name]].get("normalized"):
+            attributes[own] = attributes[name]
+    if primitive.get("mode") == _FAN_MODE:
+        primitive["mode"] = _STRIP_MODE
+        attributes[_FAN] = attributes["POSITION"]
+
+
+def _fractions(found: np.ndarray) -> Float[np.ndarray, "V columns"]:
+    """Integers as fractions of their largest."""
+    return np.maximum(found.astype(np.float32) / np.iinfo(found.dtype).max, -1)
 
 
 def _refuse(constant: str) -> None:

@@ -23,14 +23,22 @@ _LISTS = (
     "textures",
 )
 _DRACO = "KHR_draco_mesh_compression"
+_EXTENSIONS = (  # that are read, with Draco's where its decoder is installed
+    "EXT_texture_webp",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+)
+_MODES = 7  # points, three kinds of lines, triangles, strips and fans of them
 
 
 def check_structure(tree: dict[str, Any]) -> None:
-    """Check sizes, offsets, indices and that nodes form trees.
+    """Check sizes, offsets, indices, extensions that are needed, and that nodes form trees.
 
     Raises:
         ValueError: for anything that glTF does not allow, without the file's name.
     """
+    _check_extensions(tree)
     for key in _LISTS:
         _check_list(tree, key)
     for number in range(len(entries(tree, "bufferViews"))):
@@ -63,6 +71,22 @@ def _check_list(tree: dict[str, Any], key: str, where: str = "") -> list[Any]:
     if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
         raise ValueError(f"{where}{key}: wanted a list of objects, got {found!r:.40}")
     return found
+
+
+def _check_extensions(tree: dict[str, Any]) -> None:
+    required = tree.get("extensionsRequired", [])
+    if not isinstance(required, list):
+        raise ValueError(f"extensionsRequired: wanted a list of names, got {required!r:.40}")
+    known = (*_EXTENSIONS, *([_DRACO] if _decodes_draco() else []))
+    for name in required:
+        if name not in known:
+            raise ValueError(
+                f"extensionsRequired: wanted extensions among {', '.join(known)}, got {name!r:.80}"
+            )
+
+
+def _decodes_draco() -> bool:
+    return util.find_spec("DracoPy") is not None
 
 
 def _natural(entry: dict[str, Any], key: str, where: str, default: int | None = None) -> int:
@@ -118,12 +142,15 @@ def _check_primitive(tree: dict[str, Any], primitive: dict[str, Any], where: str
     attributes, extensions = primitive.get("attributes"), primitive.get("extensions", {})
     if not isinstance(attributes, dict) or not isinstance(extensions, dict):
         raise ValueError(f"{where}: wanted objects as attributes and extensions of its primitives")
+    mode = primitive.get("mode", 4)
+    if type(mode) is not int or not 0 <= mode < _MODES:
+        raise ValueError(f"{where}: wanted a mode in [0, {_MODES}), got {mode!r:.40}")
     used = dict(attributes)
     if "indices" in primitive:
         used["indices"] = primitive["indices"]
     for name, index in used.items():
         check_index(f"{where}: {name}", index, accessors)
-        decoded = _DRACO in extensions and util.find_spec("DracoPy") is not None
+        decoded = _DRACO in extensions and _decodes_draco()
         if not decoded and ("bufferView" not in accessors[index] or "sparse" in accessors[index]):
             raise ValueError(
                 f"{where}: wanted plain values as {name}, got compressed or sparse ones, or none"

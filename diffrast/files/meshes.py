@@ -61,7 +61,7 @@ def load_mesh(path: str | Path) -> Mesh:
     texture coordinates are those of the file, else `None` (`with_normals` makes smooth normals);
     where only some geometries have them the others get area-weighted normals, or uv (0, 0). An
     OBJ vertex that occurs with several texture coordinates or normals is split. STL files hold
-    triangles with their own corners and no vertex normals.
+    triangles with their own corners and no vertex normals. Points, lines and colours are left out.
 
     Args:
         path: the file; its suffix names the format.
@@ -210,21 +210,27 @@ def _scene_parts(
             uvs = _gltf.coordinates_of(geometry, use)
             if use is not None and "texture" in fields:
                 fields |= {"wrap": use.wrap, "filter": use.filter}
-        mesh = _converted(geometry, uvs)
+        mesh = _converted(geometry, uvs, is_gltf=uses is not None)
         if not np.array_equal(matrix, np.eye(4)):
             mesh = transform(mesh, matrix)
         yield MeshPart(name, mesh, **fields)
 
 
-def _converted(geometry: Any, uvs: Any) -> Mesh:
+def _converted(geometry: Any, uvs: Any, *, is_gltf: bool) -> Mesh:
+    vertices, faces = np.array(geometry.vertices), np.array(geometry.faces)
     normals = None
     # `vertex_normals` would be computed where the file has none; its cache tells.
     if "vertex_normals" in geometry._cache:
-        normals = normalize(np.array(geometry.vertex_normals))
+        normals = np.array(geometry.vertex_normals)
+    if is_gltf:
+        faces = _gltf.faces_of(geometry)
+        vertices = _gltf.vectors_of(geometry, "POSITION", vertices)
+        if normals is not None:
+            normals = _gltf.vectors_of(geometry, "NORMAL", normals)
     return Mesh(
-        vertices=np.array(geometry.vertices),
-        faces=np.array(geometry.faces),
-        normals=normals,
+        vertices=vertices,
+        faces=faces,
+        normals=None if normals is None else normalize(normals),
         uvs=None if uvs is None else np.array(uvs)[:, :2],
     )
 
