@@ -170,6 +170,9 @@ def whole(folder):
         "text.off": OFF.encode(),
         "text.ply": PLY.encode(),
         "text.stl": STL.encode(),
+        "polygons.ply": PLY_HEADER.replace("face 1", "face 2").format("int").encode()
+        + np.arange(9, dtype="<f4").tobytes()
+        + b"\4\0\0\0\0\1\0\0\0\2\0\0\0\1\0\0\0\3\2\0\0\0\1\0\0\0\0\0\0\0",
         "house.dat": (DATA / "house.dat").read_bytes(),
         "patch.bez": (DATA / "patch.bez").read_bytes(),
         "scene.dat": (DATA / "scene1.dat").read_bytes().replace(b"patch.dat", b"patch.bez"),
@@ -247,7 +250,16 @@ def broken(content, damages):
 
 
 @pytest.mark.parametrize(
-    "name", ["text.off", "text.ply", "binary.ply", "text.stl", "binary.stl", "text.obj"]
+    "name",
+    [
+        "text.off",
+        "text.ply",
+        "binary.ply",
+        "polygons.ply",
+        "text.stl",
+        "binary.stl",
+        "text.obj",
+    ],
 )
 def test_damaged_meshes(folder, whole, name):
     path = folder / f"damaged.{name.split('.')[1]}"
