@@ -80,6 +80,7 @@ ORDER = [
     "diffrast.scene",
     "diffrast.files._folder",
     "diffrast.files._mesh_text",
+    "diffrast.files._ply",
     "diffrast.files._gltf_structure",
     "diffrast.files._gltf",
     "diffrast.files.images",

@@ -75,6 +75,30 @@ def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
     assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
 
 
+def test_outlines_under_a_lens():
+    """A lens bends where vertices are shown, not where a lamp stands, far out of what it shows."""
+    size = 40
+    lamp = dr.PointLight(position=(2.0, -1.5, 5.0), shadow=dr.Shadow(resolution=256))
+    tiles = dr.Object(shapes.plane(4.0, 4.0, divisions=24))
+    body = dr.Object(shapes.icosphere(3, 0.7), transform=linalg.translation((0.2, 0.1, 0.9)))
+    scene = dr.Scene(objects=[body, tiles], lights=[lamp])
+    camera = dr.Camera.opencv(
+        intrinsics=[[48, 0, 20], [0, 48, 20], [0, 0, 1]],
+        rotation=np.diag([1, -1, -1]) @ np.asarray(linalg.rotation_x(-0.7))[:3, :3],
+        translation=(0.1, 0, 4),
+        width=size,
+        height=size,
+        near=0.5,
+        far=20,
+        distortion=(-0.2, 0.05, 0, 0, 0),
+    )
+    got, want = (
+        dr.render(scene, camera, dr.RenderSettings(height=size, width=size, **options))
+        for options in ({}, {"antialias": False, "samples": 256})
+    )
+    assert np.mean(np.abs(got - want)) < 1.5e-3  # with the lamp's place bent, three times as much
+
+
 def test_pairs_of_pixels_without_an_outline_are_counted():
     scene = dr.Scene(objects=[ball(2), floor()], lights=[sun(), sun((0.5, -1.0, 0.2))])
     found = dr.shadow_outlines(scene, ROUND_THE_CORNER, settings())
