@@ -4,6 +4,7 @@ Shapes and dtypes are checked always, also while tracing. Values (finite numbers
 can only be checked where they are known: a traced array passes.
 """
 
+import contextlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +28,17 @@ def is_concrete(value: Any) -> bool:
 def strongly_typed(value: Any) -> Array:
     """With a type of its own, not that of a number in the code, for which JAX compiles anew."""
     known = isinstance(value, Array) and not value.weak_type
-    return value if known else jnp.asarray(value, jnp.result_type(value))
+    with staying_known(value):
+        return value if known else jnp.asarray(value, jnp.result_type(value))
+
+
+def staying_known(*values: Any) -> contextlib.AbstractContextManager[None]:
+    """A context in which what is made of known numbers is known, inside of `jax.jit` too.
+
+    There JAX would trace it, like everything else. Of traced numbers nothing changes.
+    """
+    known = all(is_concrete(leaf) for leaf in jax.tree.leaves(values))
+    return jax.ensure_compile_time_eval() if known else contextlib.nullcontext()
 
 
 def float_array(
@@ -53,10 +64,11 @@ def float_array(
     is_real = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
     if not is_real:
         raise ValueError(f"{name}: wanted real numbers, got dtype {array.dtype}")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    elif array.dtype != jnp.float64:
-        array = array.astype(jnp.promote_types(array.dtype, jnp.float32))
+    with staying_known(array):
+        if not jnp.issubdtype(array.dtype, jnp.floating):
+            array = array.astype(jnp.result_type(float))
+        elif array.dtype != jnp.float64:
+            array = array.astype(jnp.promote_types(array.dtype, jnp.float32))
     _check_shape(name, array.shape, shape)
     if finite and is_concrete(array):
         bad = np.argwhere(~np.isfinite(np.asarray(array)))
@@ -87,7 +99,8 @@ def index_array(
                 f"{name}: wanted indices in [{minimum}, {bound}), got {numbers[where]} at index"
                 f" {where} ({len(bad)} such value{'s' if len(bad) > 1 else ''})"
             )
-    return array.astype(jnp.int32)
+    with staying_known(array):
+        return array.astype(jnp.int32)
 
 
 def real_number(name: str, value: Any, *, above: float = -np.inf, below: float = np.inf) -> Array:
@@ -190,7 +203,8 @@ def one_of(name: str, value: Any, choices: tuple[str, ...]) -> str:
 
 def _array(name: str, value: Any, wanted: str) -> Array:
     try:
-        with np.errstate(over="ignore"):  # infinity is dealt with as such
+        # Infinity is dealt with as such.
+        with np.errstate(over="ignore"), staying_known(value):
             return jnp.asarray(value)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         reason = str(error).split("\n")[0]

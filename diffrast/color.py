@@ -1,6 +1,7 @@
 """Colour: transfer functions, hue, lightness and saturation, and look-up tables."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
@@ -126,7 +127,7 @@ class LookUpTable:
         count = positions.shape[0]
         if count < 2:
             raise ValueError(f"positions: wanted at least two vertices, got {count}")
-        if is_concrete(positions) and not jnp.all(positions[1:] > positions[:-1]):
+        if is_concrete(positions) and not np.all(np.diff(np.asarray(positions)) > 0):
             raise ValueError(f"positions: wanted them in ascending order, got {positions}")
         set_field(self, "positions", positions)
         set_field(self, "colors", float_array("colors", colors, (count, "channels")))

@@ -30,7 +30,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from diffrast._check import ArrayInput, float_array, is_concrete
+from diffrast._check import ArrayInput, float_array, is_concrete, staying_known
 from diffrast._stored import stored
 
 _FEW = range(2, 5)  # components of a vector
@@ -227,7 +227,8 @@ def invert(matrix: ArrayInput) -> Float[Array, "4 4"]:
             (under `jit`) gives zeros with zero gradient.
     """
     matrix = float_array("matrix", matrix, (4, 4))
-    regular = jnp.all(jnp.isfinite(jnp.linalg.inv(jax.lax.stop_gradient(matrix))))
+    with staying_known(matrix):
+        regular = jnp.all(jnp.isfinite(jnp.linalg.inv(jax.lax.stop_gradient(matrix))))
     if is_concrete(matrix) and not regular:
         raise ValueError(f"matrix: wanted a regular matrix, got {np.asarray(matrix).tolist()}")
     safe = jnp.where(regular, matrix, jnp.eye(4, dtype=matrix.dtype))

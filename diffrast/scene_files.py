@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from diffrast import linalg, viewing
-from diffrast._check import file_path, flag, float_array, one_of
+from diffrast._check import file_path, flag, float_array, one_of, staying_known
 from diffrast.camera import Camera
 from diffrast.files._folder import inside
 from diffrast.files.bezier import load_bezier
@@ -63,7 +63,8 @@ def read_scene(path: str | Path) -> FileScene:
     file = load_scene_file(path)
     meshes = [_object(_file_of(path, item.name)) for item in file.objects]
     try:
-        return _assembled(file, meshes)
+        with staying_known(meshes):
+            return _assembled(file, meshes)
     except ValueError as error:  # numbers that make no picture: too large ones
         raise ValueError(f"{path}: {error}") from error
 

@@ -249,7 +249,7 @@ def _known(number: Array, default: float = np.inf) -> float:
 def _window_rows(window: ArrayInput, distance: Array) -> tuple[Array, Array]:
     """Rows x and y of the projection onto a window."""
     left, right, bottom, top = window = float_array("window", window, (4,))
-    if is_concrete(window) and not (float(left) < float(right) and float(bottom) < float(top)):
+    if is_concrete(window) and not np.all(np.asarray(window)[::2] < np.asarray(window)[1::2]):
         raise ValueError(
             "window: wanted its minimum, maximum in x, then in y, each minimum below its maximum,"
             f" got {np.asarray(window).tolist()}"

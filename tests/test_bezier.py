@@ -238,6 +238,13 @@ def test_teapot_parts_have_no_cracks(name):
     np.testing.assert_allclose(part.normals, part.normals[dm.weld(part.vertices)], atol=5e-6)
 
 
+def test_known_patches_are_merged_inside_of_jit():
+    outside = bezier_mesh(cap(), 2, merge_tolerance=1e-3)
+    inside = jax.jit(lambda: bezier_mesh(cap(), 2, merge_tolerance=1e-3))()
+    np.testing.assert_array_equal(inside.vertices, outside.vertices)
+    np.testing.assert_array_equal(inside.faces, outside.faces)
+
+
 def test_teapot_refuses():
     with pytest.raises(ValueError, match="surfaces: wanted one of body, handle"):
         teapot(surfaces=["cup"])

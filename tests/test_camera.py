@@ -570,3 +570,11 @@ def test_precision_follows_the_input():
 def test_errors_name_the_argument(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_known_numbers_are_checked_inside_of_jit():
+    with pytest.raises(ValueError, match="far: wanted a number between 5 and inf, got 1"):
+        jax.jit(lambda: perspective(near=5.0, far=1.0))()
+    options = {"distance": 1.0, "near": 1.0, "far": 5.0}
+    with pytest.raises(ValueError, match="window: wanted its minimum"):
+        jax.jit(lambda: viewing.perspective_projection(window=(1, -1, -1, 1), **options))()

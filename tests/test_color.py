@@ -127,6 +127,16 @@ def test_profiles_are_linear_between_their_vertices():
     np.testing.assert_array_equal(dr.look_up(table, np.array(positions)), np.float32(colors))
 
 
+def test_known_profiles_are_checked_inside_of_jit():
+    def middle(positions):
+        table = dr.LookUpTable(positions=positions, colors=[[0.0], [1]])
+        return dr.look_up(table, 0.5)
+
+    np.testing.assert_array_equal(jax.jit(lambda: middle([0.0, 1]))(), [0.5])
+    with pytest.raises(ValueError, match="positions: wanted them in ascending order"):
+        jax.jit(lambda: middle([1.0, 0]))()
+
+
 def test_look_up_derivatives():
     def colors(values, positions, colors):
         return dr.look_up(dr.LookUpTable(positions=positions, colors=colors), values)

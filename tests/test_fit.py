@@ -366,6 +366,13 @@ def test_gaussian_blur():
     np.testing.assert_allclose(grey, blurred[..., 1], atol=1e-7)
 
 
+def test_known_numbers_stay_known_inside_of_a_fit():
+    image = np.ones((9, 9, 3))
+    blur = fit.gaussian_blur  # with a radius that follows from sigma
+    result = fit.least_squares(lambda p: blur(p[0] * image - 0.5, 2.0), jnp.zeros(1))
+    np.testing.assert_allclose(result.params, 0.5, rtol=1e-6)
+
+
 def test_gaussian_blur_is_differentiable():
     with jax.enable_x64(True):
         image = np.random.default_rng(0).normal(size=(6, 5))

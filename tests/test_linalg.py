@@ -289,3 +289,10 @@ def test_a_zero_axis_of_unknown_value_turns_nothing():
     )
     np.testing.assert_array_equal(matrix, np.eye(4))
     assert np.isfinite(derivative).all()
+
+
+def test_known_matrices_are_inverted_inside_of_jit():
+    inverse = jax.jit(lambda: linalg.invert(2 * np.eye(4)))()
+    np.testing.assert_array_equal(inverse, np.eye(4) / 2)
+    with pytest.raises(ValueError, match="matrix: wanted a regular matrix"):
+        jax.jit(lambda: linalg.invert(np.ones((4, 4))))()

@@ -396,6 +396,19 @@ def test_a_wireframe_leaves_out_what_is_hidden():
     np.testing.assert_allclose(image, image[..., :1] * [1, 0.5, 0.25], atol=1e-6)
 
 
+def test_wireframes_of_known_meshes_are_drawn_inside_of_transformations():
+    scene = dr.Scene(objects=[dr.Object(dr.shapes.cube())])
+
+    def image(eye):
+        camera = dr.Camera.perspective(eye=eye, target=(0, 0, 0), fov_y=1.0, near=1.0, far=9.0)
+        return dr.wireframe(scene, camera, height=12, width=12)
+
+    eye = jnp.array([1.0, 2, 4])
+    single = image(eye)
+    np.testing.assert_allclose(jax.jit(image)(eye), single, atol=1e-6)
+    np.testing.assert_allclose(jax.lax.map(image, eye[None])[0], single, atol=1e-6)
+
+
 def test_normals_show_in_a_wireframe():
     shown = dl.normal_lines(SQUARE, np.tile([0.0, 0, 1], (4, 1)), 0.5)
     np.testing.assert_array_equal(shown.lines, [[0, 4], [1, 5], [2, 6], [3, 7]])

@@ -446,3 +446,18 @@ def test_no_vertices_and_no_faces_left():
     assert len(dm.weld(np.zeros((0, 3)))) == 0
     with pytest.raises(ValueError, match="tolerance: wanted one that leaves a face, got 9"):
         dm.merge_near_vertices(cube(), 9)
+
+
+def test_known_meshes_are_made_inside_of_jit():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+    def meshes():
+        uvs, uv_faces = np.zeros((3, 2)), [[0, 1, 2], [2, 1, 0]]
+        made = dm.from_polygons(corners, [[0, 1, 2, 3]])
+        with_uvs = Mesh(vertices=made.vertices, faces=made.faces, uvs=uvs, uv_faces=uv_faces)
+        return made, dm.split_uvs(with_uvs), dm.merge_near_vertices(made, 1e-3)
+
+    for inside, outside in zip(jax.jit(meshes)(), meshes(), strict=True):
+        assert jax.tree.structure(inside) == jax.tree.structure(outside)
+        for one, other in zip(*map(jax.tree.leaves, (inside, outside)), strict=True):
+            np.testing.assert_array_equal(one, other)

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -159,3 +160,9 @@ def test_a_scene_renders_in_all_its_operations(tmp_path):
     assert 0.05 < shares["wireframe"] < shares["normals"] < 0.25
     with pytest.raises(ValueError, match="operation: wanted one of wireframe, normals"):
         dr.render_scene_file(tmp_path / "small.dat", operation="raytrace")
+
+
+def test_a_scene_is_read_inside_of_jit():
+    path = DATA / "scene1.dat"
+    camera = jax.jit(lambda: dr.read_scene(path).camera)()
+    np.testing.assert_array_equal(camera.projection, dr.read_scene(path).camera.projection)

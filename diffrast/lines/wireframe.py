@@ -48,9 +48,9 @@ def mesh_edges(mesh: Mesh, *, flat: bool = False) -> Int[np.ndarray, "edges 2"]:
     if flat:
         return adjacency.edges
     corners = positions[faces]
-    normals = np.asarray(
-        normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    )
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    with _check.staying_known(across):
+        normals = np.asarray(normalize(across))
     one, other = (normals[np.maximum(adjacency.edge_faces[:, k], 0)] for k in range(2))
     bent = np.linalg.norm(np.cross(one, other), axis=1) > _FLAT
     bent |= (np.sum(one * other, axis=1) < 0) | (adjacency.edge_faces[:, 1] < 0)

@@ -69,11 +69,12 @@ def from_polygons(
     normals = np.zeros((len(pairs), 3))
     np.add.at(normals, owner, share)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(
-        vertices=positions_device[pairs[:, 0]],
-        faces=jnp.asarray(owner[triangles]),
-        normals=jnp.asarray(normals / np.where(length > 0, length, 1), positions_device.dtype),
-    )
+    with _check.staying_known(positions_device):
+        return Mesh(
+            vertices=positions_device[pairs[:, 0]],
+            faces=jnp.asarray(owner[triangles]),
+            normals=jnp.asarray(normals / np.where(length > 0, length, 1), positions_device.dtype),
+        )
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
@@ -179,12 +180,13 @@ def split_uvs(mesh: Mesh) -> Mesh:
         np.stack([faces, uv_faces], axis=-1).reshape(-1, 2), axis=0, return_inverse=True
     )
     vertex, uv = pairs.T
-    return Mesh(
-        vertices=mesh.vertices[vertex],
-        faces=jnp.asarray(index.reshape(-1, 3)),
-        normals=None if mesh.normals is None else mesh.normals[vertex],
-        uvs=mesh.uvs[uv],
-    )
+    with _check.staying_known(mesh):
+        return Mesh(
+            vertices=mesh.vertices[vertex],
+            faces=jnp.asarray(index.reshape(-1, 3)),
+            normals=None if mesh.normals is None else mesh.normals[vertex],
+            uvs=mesh.uvs[uv],
+        )
 
 
 def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
@@ -213,19 +215,20 @@ def merge_near_vertices(mesh: Mesh, tolerance: ArrayLike) -> Mesh:
     used, first_use, index = np.unique(corners, return_index=True, return_inverse=True)
     order = np.argsort(first_use)
     kept = used[order]
-    normals = None
-    if mesh.normals is not None:
-        normals = normalize(jnp.zeros_like(mesh.normals).at[leader].add(mesh.normals))[kept]
-    uvs, uv_faces = mesh.uvs, mesh.uv_faces
-    if uvs is not None and uv_faces is None:
-        uvs = uvs[kept]
-    return Mesh(
-        vertices=mesh.vertices[kept],
-        faces=jnp.asarray(np.argsort(order)[index].reshape(-1, 3)),
-        normals=normals,
-        uvs=uvs,
-        uv_faces=None if uv_faces is None else uv_faces[proper],
-    )
+    with _check.staying_known(mesh):
+        normals = None
+        if mesh.normals is not None:
+            normals = normalize(jnp.zeros_like(mesh.normals).at[leader].add(mesh.normals))[kept]
+        uvs, uv_faces = mesh.uvs, mesh.uv_faces
+        if uvs is not None and uv_faces is None:
+            uvs = uvs[kept]
+        return Mesh(
+            vertices=mesh.vertices[kept],
+            faces=jnp.asarray(np.argsort(order)[index].reshape(-1, 3)),
+            normals=normals,
+            uvs=uvs,
+            uv_faces=None if uv_faces is None else uv_faces[proper],
+        )
 
 
 def _with_bodies(topology: Topology) -> Topology:

@@ -93,7 +93,8 @@ def _topology_of(vertices: Array, faces: Array) -> Topology | None:
     if not (_check.is_concrete(vertices) and _check.is_concrete(faces)):
         return None
     topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces))
-    return jax.tree.map(jnp.asarray, topology)
+    with _check.staying_known(vertices, faces):
+        return jax.tree.map(jnp.asarray, topology)
 
 
 def arrays(vertices: ArrayInput, faces: ArrayInput) -> tuple[Array, Array]:

@@ -109,18 +109,20 @@ def bezier_mesh(
     if _check.is_concrete(control):
         numbers = np.asarray(control, dtype=np.float64)
         exact = _evaluate(numbers, *parameters, epsilon=_epsilon(control), xp=np)
-        points = PatchPoints(*(jnp.asarray(values, control.dtype) for values in exact))
+        with _check.staying_known(control):
+            points = PatchPoints(*(jnp.asarray(values, control.dtype) for values in exact))
     else:
         rounded = [jnp.asarray(values, control.dtype) for values in parameters]
         points = _evaluate_traced(control, *rounded, epsilon=_epsilon(control))
     patches, samples = points.position.shape[:2]
     faces = grid_faces(columns, rows) + samples * np.arange(patches)[:, None, None]
-    mesh = Mesh(
-        vertices=points.position.reshape(-1, 3),
-        faces=faces.reshape(-1, 3),
-        normals=points.normal.reshape(-1, 3),
-        uvs=np.tile(uvs, (patches, 1)) if merge_tolerance is None else None,
-    )
+    with _check.staying_known(points):
+        mesh = Mesh(
+            vertices=points.position.reshape(-1, 3),
+            faces=faces.reshape(-1, 3),
+            normals=points.normal.reshape(-1, 3),
+            uvs=np.tile(uvs, (patches, 1)) if merge_tolerance is None else None,
+        )
     return mesh if merge_tolerance is None else merge_near_vertices(mesh, merge_tolerance)
 
 
