@@ -129,8 +129,11 @@ def test_chance_follows_its_key_and_its_probabilities():
     assert once != system.expand(1, key=jax.random.key(2))
     assert abs(once.count("+") / 4000 - 0.25) < 0.03
     assert len(system.expand(2, key=jax.random.key(1))) > 16000
-    with pytest.raises(ValueError, match="key: wanted a random key"):
-        system.draw(1)
+    for key in (None, jnp.zeros(2), jax.random.split(jax.random.key(0))):
+        with pytest.raises(ValueError, match="key: wanted a random key"):
+            system.draw(1, key=key)
+    with pytest.raises(ValueError, match="key: wanted a random key of JAX that is known"):
+        jax.jit(lambda key: system.draw(1, key=key).points)(jax.random.key(0))
 
 
 @pytest.mark.parametrize(("make", "rounds"), [(plant, 2), (lambda: plant(3), 1)])
@@ -165,6 +168,20 @@ def test_systems_refuse(options, message):
     given = {"initiator": "F", "rules": {"F": "FF"}, "angle": 0.5, "alphabet": "F"}
     with pytest.raises(ValueError, match=message):
         dr.LSystem(**given | options)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize(("initiator", "rules"), [("", {}), ("FF", {"F": ""})])
+def test_nothing_is_drawn_of_an_empty_string(initiator, rules, dimensions):
+    def drawing(angle):
+        system = dr.LSystem(initiator=initiator, rules=rules, angle=angle, dimensions=dimensions)
+        return system.draw(1)
+
+    drawn = drawing(0.3)
+    np.testing.assert_array_equal(drawn.points, np.zeros((1, dimensions)))  # the start
+    assert drawn.lines.shape == (0, 2)
+    assert drawn.symbols.shape == drawn.depths.shape == (0,)
+    assert jax.grad(lambda angle: jnp.sum(drawing(angle).points ** 2))(0.3) == 0
 
 
 def test_strings_that_are_too_long_are_refused():

@@ -222,18 +222,29 @@ class LSystem:
     def _codes(self, iterations: int, key: Array | None) -> np.ndarray:
         iterations = _check.positive_int("iterations", iterations, minimum=0, maximum=1 << 16)
         chance = any(len(options) > 1 for _, options in self.rules)
-        if not chance:
-            key = None
-        elif key is None:
-            raise ValueError("key: wanted a random key of JAX for rules with several choices")
+        key = _known_key(key) if chance else None
         codes = np.frombuffer(self.initiator.encode("latin-1"), np.uint8)
         for round_ in range(iterations):
             uniform = np.zeros(len(codes))
             if key is not None:
-                own = jax.random.fold_in(key, round_)
-                uniform = np.asarray(jax.random.uniform(own, (len(codes),)))
+                with _check.staying_known(key):
+                    own = jax.random.fold_in(key, round_)
+                    uniform = np.asarray(jax.random.uniform(own, (len(codes),)))
             codes = _rewritten(codes, self.rules, uniform)
         return codes
+
+
+def _known_key(key: Any) -> Array:
+    if not _check.is_concrete(key):
+        raise ValueError("key: wanted a random key of JAX that is known, got a traced one")
+    try:
+        with _check.staying_known(key):
+            jax.random.fold_in(key, 0)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"key: wanted a random key of JAX for rules with several choices, got {key!r:.40}"
+        ) from error
+    return key
 
 
 def _choices(symbol: str, rule: Rule) -> tuple[tuple[float, str], ...]:
@@ -291,14 +302,14 @@ def _rewritten(codes: np.ndarray, rules: Any, uniform: np.ndarray) -> np.ndarray
 def _levels(codes: np.ndarray) -> list[Branches]:
     """The symbols by depth of brackets, the trunk first; closing brackets belong nowhere.
 
-    An opening bracket stands on the branch that it leaves.
+    An opening bracket stands on the branch that it leaves. An empty string has no trunk.
     """
     opens = codes == _OPEN
     depth = np.cumsum(opens.astype(np.int32) - (codes == _CLOSE)) - opens
     inside = codes != _CLOSE
     places = np.arange(len(codes))
     levels = []
-    for level in range(int(depth[inside].max(initial=0)) + 1):
+    for level in range(int(depth[inside].max(initial=-1)) + 1):
         symbols = np.flatnonzero(inside & (depth == level))
         opened = np.full(len(codes), -1)
         if level:
