@@ -304,17 +304,26 @@ def transform_directions(matrix: ArrayInput, directions: ArrayInput) -> Float[Ar
 def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "*batch 3"]:
     """Unit normals (..., 3) of surfaces that an affine 4x4 matrix moves; a zero one stays zero."""
     matrix, normals = _matrix_and_vectors(matrix, "normals", normals)
-    return normalize(apply_matrix(normal_matrix(matrix), normals))
+    return normalize(apply_matrix(normal_turn(matrix), normals))
 
 
 def normal_matrix(matrix: ArrayInput) -> Float[Array, "3 3"]:
     """What an affine 4x4 matrix does to normals, but for their length. Differentiable.
 
-    A multiple of the inverse transpose, by cofactors: a matrix that flattens space gives normals of
-    the plane it flattens to.
+    A multiple of the inverse transpose, by cofactors of the matrix divided by its largest number: a
+    matrix that flattens space gives normals of the plane it flattens to.
     """
     linear = float_array("matrix", matrix, (4, 4), finite=False)[:3, :3]
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(linear)))
+    return _cofactors(linear, jnp.max(jnp.abs(linear)))
+
+
+def normal_turn(matrix: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
+    """The same for normals that become unit vectors: its derivative leaves out their length."""
+    linear = matrix[:3, :3]
+    return _cofactors(linear, jax.lax.stop_gradient(jnp.max(jnp.abs(linear))))
+
+
+def _cofactors(linear: Array, largest: Array) -> Array:
     a, b, c = (linear / jnp.where(largest > 0, largest, 1)).T
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     orientation = jnp.where(dot(a, cofactors[:, 0]) < 0, -1, 1)

@@ -157,6 +157,11 @@ def test_normals_follow_the_inverse_transpose(mirror, scale):
     np.testing.assert_allclose(linalg.transform_normals(matrix, normals), wanted, atol=2e-5)
 
 
+def test_normal_matrices_have_the_derivative_of_their_value():
+    with jax.enable_x64(True):
+        check_derivatives(linalg.normal_matrix, np.random.default_rng(1).normal(size=(4, 4)))
+
+
 def test_normals_of_singular_transforms_are_finite():
     normals = jnp.asarray([[0.0, 0.0, 1.0], [1.0, 2.0, 3.0], [1.0, 0.0, 0.0]])
     flat = linalg.scaling((2, 3, 0))
