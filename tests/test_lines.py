@@ -409,6 +409,22 @@ def test_wireframes_of_known_meshes_are_drawn_inside_of_transformations():
     np.testing.assert_allclose(jax.lax.map(image, eye[None])[0], single, atol=1e-6)
 
 
+@pytest.mark.parametrize("far", [1e6, 1e12, 1e30])
+def test_either_end_of_a_line_may_be_far_away(far):
+    weights = np.arange(8)[:, None, None]
+
+    def total(points, lines):
+        image = dr.draw_lines(points, lines, height=8, width=4)
+        return jnp.sum(weights * image), image
+
+    points = jnp.array([[2.0, 4.25], [-far, 4.25]])
+    slopes, image = jax.grad(total, has_aux=True)(points, [[0, 1]])
+    reversed_slopes, reversed_image = jax.grad(total, has_aux=True)(points, [[1, 0]])
+    np.testing.assert_allclose(image[4, :3, 0], [0.75, 0.75, 0], atol=1e-6)
+    np.testing.assert_allclose(reversed_image, image, atol=1e-6)
+    np.testing.assert_allclose(reversed_slopes, slopes, rtol=1e-4, atol=1e-6)
+
+
 def test_normals_show_in_a_wireframe():
     shown = dl.normal_lines(SQUARE, np.tile([0.0, 0, 1], (4, 1)), 0.5)
     np.testing.assert_array_equal(shown.lines, [[0, 4], [1, 5], [2, 6], [3, 7]])

@@ -105,7 +105,8 @@ def draw_lines(
     Args:
         points: (points, 2) in pixels: x to the right and y down from the image's top left corner,
             so that the middle of pixel (row i, column j) is (j + 0.5, i + 0.5). They may lie
-            anywhere.
+            anywhere. Not all of a line between two points more than 10^10 pixels away (in float32),
+            whose digits do not tell where it crosses the image, need be drawn.
         lines: (lines, 2) numbers of the points that each line joins.
         colors: (lines, 3) or (3,) linear RGB.
         height: rows of the image.

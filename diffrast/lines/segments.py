@@ -1,7 +1,8 @@
 """Lines on the screen: what is left of them in view, in pixels, with their depth.
 
 Lines are cut in homogeneous coordinates, where a point behind the eye is as good as another: of
-A + t (B - A) the interval of t is kept in which near, far and a guard band round the image hold.
+A + t (B - A) the interval of t is kept in which near, far and a guard band round the image hold,
+with A the end of smaller coordinates: the other one's digits may be too coarse for the image.
 The band, twice as wide as that of triangles (`fixed_point.GUARD_BITS`), leaves lines near the image
 whole, and lets what follows count in fixed point. The cuts carry no derivative: a line that is cut
 keeps its direction, and its cut ends are where nobody looks.
@@ -68,6 +69,9 @@ def depth_rank(positions_clip: Float[Array, "points 4"]) -> Float[Array, " point
 
 
 def _cut(points: Array, rank: Array, lines: Array, height: int, width: int) -> Segments:
+    size = jnp.max(jnp.abs(lax.stop_gradient(points)), axis=1)
+    swap = (size[lines[:, 0]] > size[lines[:, 1]])[:, None]
+    lines = jnp.where(swap, lines[:, ::-1], lines)
     first, second = points[lines[:, 0]], points[lines[:, 1]]
     finite = jnp.all(jnp.isfinite(first) & jnp.isfinite(second), axis=1)
     first, second = (jnp.where(finite[:, None], p, 0) for p in (first, second))
@@ -88,7 +92,14 @@ def _cut(points: Array, rank: Array, lines: Array, height: int, width: int) -> S
         )
         keys.append(lax.stop_gradient(numerator * inverse))
     start, end, both = (jnp.where(seen[:, None], p, 0) for p in (*ends, jnp.stack(keys, axis=1)))
-    return Segments(start, end, both, jnp.stack([low, high], axis=1), seen)
+    interval = jnp.stack([low, high], axis=1)
+    return Segments(
+        jnp.where(swap, end, start),
+        jnp.where(swap, start, end),
+        jnp.where(swap, both[:, ::-1], both),
+        jnp.where(swap, 1 - interval[:, ::-1], interval),
+        seen,
+    )
 
 
 def _interval(first: Array, second: Array, height: int, width: int) -> tuple[Array, Array]:
