@@ -265,7 +265,7 @@ def to_opencv(camera: Camera, *, height: int, width: int) -> opencv.OpenCVParame
     Raises:
         ValueError: for a camera known not to be a perspective one with clip w = depth.
     """
-    _check_single(camera)
+    check_single(camera)
     parameters = opencv.parameters_from_matrices(
         camera.view, camera.projection, height=height, width=width
     )
@@ -300,7 +300,7 @@ def world_to_clip(camera: Camera, positions_world: ArrayInput) -> Float[Array, "
     The view is applied in twice the working precision, so that a model a million units from the
     origin, seen from nearby, is as steady as one at the origin. Equal positions give equal bits.
     """
-    _check_single(camera)
+    check_single(camera)
     positions_world = float_array("positions_world", positions_world, ("...", 3), finite=False)
     return _world_to_clip(camera, positions_world)
 
@@ -363,7 +363,7 @@ def viewpoint(camera: Camera) -> Float[Array, "4"]:
         ValueError: for a stack of cameras, or another tree of arrays; of what is none JAX makes
             a TypeError or OverflowError.
     """
-    _check_single(camera)
+    check_single(camera)
     matrix, pivot = pivoted_matrix(camera)
     point = null_vector(matrix[np.array([0, 1, 3])])
     point = jnp.where(dot(matrix[2], point) > 0, -point, point)
@@ -389,7 +389,7 @@ def pixel_directions(
     The second are those by a step to the next column, and to the next row: the same everywhere,
     (2, 3), for a camera without distortion, else one for each pixel.
     """
-    _check_single(camera)
+    check_single(camera)
     height, width = positive_int("height", height), positive_int("width", width)
     columns, rows = (
         (np.arange(-border, size + border) + 0.5 - size / 2).astype(camera.view.dtype)
@@ -468,7 +468,8 @@ def _placed(
     return Camera(view=view, projection=projection, view_remainder=remainder)
 
 
-def _check_single(camera: Camera) -> None:
+def check_single(camera: Camera) -> None:
+    """Check a camera that is no stack."""
     instance_of("camera", camera, Camera)
     if camera.view.ndim != 2:
         raise ValueError(

@@ -425,6 +425,19 @@ def test_either_end_of_a_line_may_be_far_away(far):
     np.testing.assert_allclose(reversed_slopes, slopes, rtol=1e-4, atol=1e-6)
 
 
+def test_wireframes_of_no_objects_are_checked_too():
+    camera = dr.Camera.perspective(eye=(0, 0, 4), target=(0, 0, 0), fov_y=1.0, near=1.0, far=9.0)
+    size = {"height": 4, "width": 6}
+    picture = np.random.default_rng(0).uniform(size=(4, 6, 3)).astype(np.float32)
+    scene = dr.Scene(objects=[], background=picture)
+    np.testing.assert_array_equal(dr.wireframe(scene, camera, **size), picture)
+    with pytest.raises(ValueError, match="camera: wanted a single camera, got a stack"):
+        dr.wireframe(scene, dr.stack_cameras([camera, camera]), **size)
+    for wrong in (picture[:1], picture[:, :4]):
+        with pytest.raises(ValueError, match=r"background: wanted shape \(3,\) or \(4, 6"):
+            dr.wireframe(dr.Scene(objects=[], background=wrong), camera, **size)
+
+
 def test_normals_show_in_a_wireframe():
     shown = dl.normal_lines(SQUARE, np.tile([0.0, 0, 1], (4, 1)), 0.5)
     np.testing.assert_array_equal(shown.lines, [[0, 4], [1, 5], [2, 6], [3, 7]])

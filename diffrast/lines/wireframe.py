@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import edge_adjacency, join_indices
-from diffrast.camera import Camera, world_to_clip
+from diffrast.camera import Camera, check_single, world_to_clip
 from diffrast.linalg import normalize, transform_normals, transform_points
-from diffrast.lines.drawing import draw_lines_with_depth
+from diffrast.lines.drawing import draw_lines, draw_lines_with_depth
 from diffrast.mesh import Mesh, vertex_normals
 from diffrast.raster import rasterize
 from diffrast.scene import Object, Scene
@@ -125,10 +125,10 @@ def wireframe(
         antialias: see `draw_lines`.
 
     Raises:
-        ValueError: for wrong shapes, and traced meshes without `edges`.
+        ValueError: for wrong shapes, a stack of cameras, and traced meshes without `edges`.
     """
     _check.instance_of("scene", scene, Scene)
-    _check.instance_of("camera", camera, Camera)
+    check_single(camera)
     hidden = _check.flag("hidden", hidden)
     cull_backfaces = _check.flag("cull_backfaces", cull_backfaces)
     if color is not None:
@@ -164,7 +164,8 @@ def wireframe(
     if isinstance(background, CubeTexture):
         background = skybox(background, camera, height, width)
     if not points:
-        return jnp.broadcast_to(background, (height, width, 3))
+        no_points, no_lines = jnp.zeros((0, 2), background.dtype), np.zeros((0, 2), np.int32)
+        return draw_lines(no_points, no_lines, height=height, width=width, background=background)
     positions_clip = world_to_clip(camera, jnp.concatenate(points))
     joined = jnp.concatenate(faces)
     fragments = None
