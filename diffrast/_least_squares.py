@@ -141,7 +141,14 @@ def _normal_equations(
     """
     flat, unravel = ravel_pytree(params)
     flat = flat + step.astype(flat.dtype)
-    r, derivative = jax.linearize(lambda x: ravel_pytree(residuals(unravel(x), *args))[0], flat)
+
+    def flat_residuals(x: Array) -> Array:
+        r = ravel_pytree(residuals(unravel(x), *args))[0]
+        if not jnp.issubdtype(r.dtype, jnp.floating):
+            raise ValueError(f"residuals: wanted floating-point numbers, got dtype {r.dtype}")
+        return r
+
+    r, derivative = jax.linearize(flat_residuals, flat)
     costs, root_weights = ROBUST_LOSSES[loss](r, scale.astype(r.dtype))
 
     def scaled_column(tangent: Array) -> tuple[Array, Array]:

@@ -28,9 +28,12 @@ def gaussian_blur(
             where `sigma` is traced.
 
     Raises:
-        ValueError: for an image of another rank, or a traced `sigma` without `radius`.
+        ValueError: for an image of another rank or without pixels, or a traced `sigma` without
+            `radius`.
     """
     image = _image(image)
+    if 0 in image.shape[:2]:
+        raise ValueError(f"image: wanted at least one pixel, got shape {image.shape}")
     sigma = real_number("sigma", sigma)
     if radius is None:
         if not is_concrete(sigma):

@@ -222,8 +222,8 @@ def least_squares(
         influence stay as they are.
 
     Raises:
-        ValueError: for parameters that are not real and finite, and for residuals or
-            a Jacobian that are not finite at the start.
+        ValueError: for parameters that are not real and finite, for residuals of whole or complex
+            numbers, and for residuals or a Jacobian that are not finite at the start.
 
     Example:
         >>> times, places = jnp.arange(4.0), jnp.array([1.0, 3, 5, 7])

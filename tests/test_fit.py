@@ -342,6 +342,8 @@ def test_bad_input(run):
 def test_more_bad_input():
     with pytest.raises(ValueError, match="loss: wanted a function to a scalar, got shape"):
         fit.minimize(lambda x: jnp.stack([x, x]), 1.0)
+    with pytest.raises(ValueError, match="residuals: wanted floating-point numbers, got dtype int"):
+        fit.least_squares(lambda p: jnp.round(p).astype(int), jnp.ones(2))
     with pytest.raises(ValueError, match="method: wanted one of"):
         fit.least_squares(jnp.asarray, 1.0, method="newton")
     with pytest.raises(ValueError, match="loss: wanted one of squared, huber"):
@@ -389,6 +391,8 @@ def test_downsample():
     assert halved.shape == (2, 3, 2)
     with pytest.raises(ValueError, match="factor: wanted a divisor of height 4 and width 6, got 4"):
         fit.downsample(image, 4)
+    with pytest.raises(ValueError, match="image: wanted at least one pixel"):
+        fit.gaussian_blur(np.zeros((0, 5)), 1.0)
     with pytest.raises(ValueError, match="image: wanted shape"):
         fit.downsample(image[0, 0], 1)
     with pytest.raises(ValueError, match="radius: wanted an integer"):
