@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         name: str, run: object, help_: str, *parents: argparse.ArgumentParser
     ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=help_, description=help_, parents=list(parents))
-        added.set_defaults(run=run)
+        added.set_defaults(run=run, default_of=added.get_default)
         return added
 
     view, look, quiet = _view_options(), _look_options(), _quiet_options()

@@ -48,6 +48,8 @@ SHAPES: dict[str, Callable[[], Mesh]] = {
     "sponge": lambda: shapes.menger_sponge(2),
 }
 _FIT_STEPS = 60
+# What else than the look of a mesh the options of `render` and `wireframe` tell.
+_FOR_SCENES = {"command", "run", "default_of", "file", "out", "operation", "no_antialias"}
 
 
 class Framing(NamedTuple):
@@ -63,10 +65,7 @@ class Framing(NamedTuple):
 def render_command(options: argparse.Namespace) -> str:
     """Draw a mesh, or a scene file."""
     if is_scene_file(options.file):
-        if options.size is not None:
-            raise ValueError(
-                f"{options.file}: a scene file has a size of its own; leave out --size"
-            )
+        _refuse_for_scenes(options)
         image = render_scene_file(
             options.file, operation=options.operation, antialias=not options.no_antialias
         )
@@ -99,9 +98,14 @@ def orbit_command(options: argparse.Namespace) -> str:
 def wireframe_command(options: argparse.Namespace) -> str:
     """Draw the edges of a mesh."""
     if is_scene_file(options.file):
-        operation = "wireframe" if options.normals is None else "normals"
+        if options.normals is not None:
+            raise ValueError(
+                f"{options.file}: normals of a scene file have a length of their own; leave out"
+                " --normals, and use render --operation normals"
+            )
+        _refuse_for_scenes(options)
         image = render_scene_file(
-            options.file, operation=operation, antialias=not options.no_antialias
+            options.file, operation="wireframe", antialias=not options.no_antialias
         )
         return _written(options.out, image)
     mesh = load(options.file)
@@ -248,6 +252,20 @@ def is_scene_file(file: str) -> bool:
     return not (len(first) == 3 and all(word.isdigit() for word in first))
 
 
+def _refuse_for_scenes(options: argparse.Namespace) -> None:
+    """Tell options that have no effect on the picture of a scene file."""
+    given = {
+        name
+        for name, value in vars(options).items()
+        if name not in _FOR_SCENES and value != options.default_of(name)
+    }
+    if given:
+        names = " ".join(f"--{name.replace('_', '-')}" for name in sorted(given))
+        raise ValueError(
+            f"{options.file}: a scene file has a view, size and look of its own; leave out {names}"
+        )
+
+
 def load(file: str) -> Mesh:
     """The mesh of a file, or the shape of a name."""
     if file in SHAPES:
@@ -272,6 +290,8 @@ def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
     reach = float(np.linalg.norm(vertices - centre, axis=1).max())
     target = centre if options.target is None else np.asarray(options.target, np.float64)
     up = np.asarray(options.up, np.float64)
+    if not (np.all(np.isfinite(up)) and np.any(up)):
+        raise ValueError(f"--up: wanted finite numbers that are not all zero, got {options.up}")
     if options.eye is None:
         # Along 1 of right, 1 of front and 0.7 of up, whichever way is up.
         axis = int(np.argmax(np.abs(up)))

@@ -65,6 +65,16 @@ def test_fit_finds_a_light(tmp_path):
         (["render", str(DATA / "scene1-as-printed.dat")], "scene1-as-printed.dat:19: wanted"),
         (["render", "cube", "--operation", "phong"], "--operation is for scene files"),
         (["render", str(DATA / "scene1.dat"), "--size", "9"], "leave out --size"),
+        (
+            ["render", str(DATA / "scene1.dat"), "--shading", "flat", "--eye", "1", "2", "3"],
+            "leave out --eye --shading",
+        ),
+        (
+            ["wireframe", str(DATA / "scene1.dat"), "--hidden", "--line-width", "2"],
+            "leave out --hidden --line-width",
+        ),
+        (["wireframe", str(DATA / "scene1.dat"), "--normals", "2"], "use render --operation"),
+        (["orbit", "cube", "--up", "0", "0", "0"], "--up: wanted finite numbers that are not all"),
         (["render", "cube", "--samples", "3", "--size", "9"], "samples: wanted a square number"),
     ],
 )
