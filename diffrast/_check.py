@@ -27,7 +27,7 @@ def is_concrete(value: Any) -> bool:
 
 def strongly_typed(value: Any) -> Array:
     """With a type of its own, not that of a number in the code, for which JAX compiles anew."""
-    known = isinstance(value, Array) and not value.weak_type
+    known = isinstance(value, Array) and not getattr(value, "weak_type", False)  # keys have none
     with staying_known(value):
         return value if known else jnp.asarray(value, jnp.result_type(value))
 

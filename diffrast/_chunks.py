@@ -134,7 +134,7 @@ def _program(
     shared, views = jax.tree.unflatten(structure, leaves)
     count = jax.ShapeDtypeStruct((), np.int32)
     if not devices:
-        return jax.jit(alone).lower(shared, views, count).compile()
+        return _compiled(jax.jit(alone), shared, views, count)
     mesh = device_mesh(devices)
     everywhere, sharded = (NamedSharding(mesh, spec) for spec in (PartitionSpec(), split))
     # Every device works for itself: what a function does with `shared`, its derivative too, stays
@@ -147,7 +147,17 @@ def _program(
         check_vma=False,
     )
     jitted = jax.jit(on_all, in_shardings=(everywhere, sharded, everywhere), out_shardings=sharded)
-    return jitted.lower(shared, views, count).compile()
+    return _compiled(jitted, shared, views, count)
+
+
+def _compiled(jitted: Any, *arguments: Any) -> Callable[..., Any]:
+    traced = jitted.trace(*arguments)
+    if len(traced.jaxpr.in_avals) > len(jax.tree.leaves(arguments)):  # JAX has added arguments
+        raise ValueError(
+            "function: wanted one that uses no traced values but its arguments, got one that uses"
+            " others, too; pass them as `shared`"
+        )
+    return traced.lower().compile()
 
 
 def in_order(
@@ -160,7 +170,7 @@ def in_order(
     devices: tuple[jax.Device, ...],
 ) -> Iterator[tuple[int, Any]]:
     """Pairs (first view, result of `work`) of `each` views, in rooms of `size` for each device."""
-    views = jax.tree.map(np.asarray, views)
+    views = jax.tree.map(_rows, views)
     shared = jax.tree.map(strongly_typed, shared)
     count, rows_at_once = jax.tree.leaves(views)[0].shape[0], size * max(len(devices), 1)
 
@@ -192,6 +202,15 @@ def in_order(
                 yield number, result.result()
         for number, result in waiting:
             yield number, result.result()
+
+
+def _rows(x: Any) -> np.ndarray:
+    if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
+        raise ValueError(
+            "views: wanted arrays of numbers, got random keys; pass `jax.random.key_data` of them,"
+            " and `jax.random.wrap_key_data` in the function"
+        )
+    return np.asarray(x)
 
 
 def _on_host(x: Array) -> Any:

@@ -114,7 +114,8 @@ def map_views(
         The tree that `function` returns, with a leading axis of views.
 
     Raises:
-        ValueError: as `render_views`.
+        ValueError: as `render_views`, and for a function that uses traced values which are not its
+            arguments while these are known.
 
     Example:
         >>> dr.views.map_views(lambda scale, x: scale * x**2, jnp.arange(4.0), 10.0).tolist()

@@ -30,6 +30,7 @@ def scene(direction=(-0.4, -0.5, -1.0)):
 
 
 CAMERAS = dr.stack_cameras([camera(turn) for turn in TURNS])
+KEYS = jax.random.split(jax.random.key(0), 5)
 DIRECTION = jnp.array([-0.4, -0.5, -1.0])
 
 
@@ -203,11 +204,33 @@ def test_the_number_of_processes_changes_no_bit():
             lambda: jax.jit(lambda v: list(views.stream_views(wave, v, 1.0)))(TURNS),
             "views: wanted known numbers",
         ),
+        (
+            lambda: jax.grad(lambda s: views.sum_views(lambda _, turn: s * turn, TURNS))(3.0),
+            "function: wanted one that uses no traced values but its arguments",
+        ),
+        (
+            lambda: jax.jit(lambda s: views.map_views(lambda _, turn: s * turn, TURNS))(3.0),
+            "function: wanted one that uses no traced values but its arguments",
+        ),
+        (
+            lambda: views.map_views(lambda _, key: jax.random.normal(key), KEYS),
+            "views: wanted arrays of numbers, got random keys",
+        ),
     ],
 )
 def test_errors_name_the_argument(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_random_keys_and_known_numbers_inside_of_jit():
+    def drawn(key, turn):
+        return turn * jax.random.uniform(key)
+
+    outside = views.map_views(drawn, TURNS, KEYS[0])
+    np.testing.assert_allclose(outside, TURNS * jax.random.uniform(KEYS[0]), rtol=1e-6)
+    inside = jax.jit(lambda: views.map_views(lambda scale, turn: scale * turn, TURNS, 2.0))()
+    np.testing.assert_array_equal(inside, 2 * TURNS)
 
 
 def test_no_views_give_no_images():
