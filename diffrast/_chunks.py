@@ -29,7 +29,7 @@ _CHUNK_BYTES = 1 << 24
 _OFF_CPU = 8  # times as many
 
 ViewFunction = Callable[[Any, Any], Any]
-Kinds = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of arrays
+Kinds = tuple[tuple[tuple[int, ...], Any], ...]  # shapes and types of arrays, random keys too
 
 
 def one_of(views: Any) -> Any:
