@@ -17,7 +17,7 @@ from diffrast._check import instance_of
 from diffrast._stored import assemble, interleaved, stored, stored_alone
 from diffrast._topology import Topology
 from diffrast.bending import Turning, find_turning
-from diffrast.camera import Camera, central_rays
+from diffrast.camera import Camera, central_rays, check_single
 from diffrast.deferred import comes_held, shade_covered
 from diffrast.edges import View, antialias_image, with_depth
 from diffrast.geometry import (
@@ -259,7 +259,7 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
 
 def _check_kinds(scene: Scene, camera: Camera, settings: RenderSettings) -> None:
     instance_of("scene", scene, Scene)
-    instance_of("camera", camera, Camera)
+    check_single(camera)
     instance_of("settings", settings, RenderSettings)
 
 

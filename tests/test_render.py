@@ -496,5 +496,6 @@ def test_a_background_of_another_size_is_an_error():
 @pytest.mark.parametrize("function", [dr.render, dr.render_buffers])
 def test_a_stack_of_cameras_is_an_error(function):
     cameras = dr.stack_cameras([scenes.perspective(), scenes.perspective()])
-    with pytest.raises(ValueError, match=r"camera: wanted a single camera, got a stack of shape"):
-        function(scenes.one_object(), cameras, settings())
+    for scene in (scenes.one_object(), dr.Scene(objects=[])):
+        with pytest.raises(ValueError, match=r"camera: wanted a single camera, got a stack of"):
+            function(scene, cameras, settings())
