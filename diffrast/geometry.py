@@ -19,10 +19,10 @@ from diffrast.edges.planes import largest
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
 from diffrast.linalg import (
+    _normal_turn,
     apply_matrix,
     mirrors,
     norm,
-    normal_turn,
     normalize,
     where_finite,
 )
@@ -137,7 +137,7 @@ def _moved(matrix: Array, points: Array) -> Array:
     return apply_matrix(matrix[:, :3], points) + matrix[:, 3]
 
 
-_turns = jax.vmap(normal_turn)
+_turns = jax.vmap(_normal_turn)
 
 
 def _turned(matrix: Array, normals: Array) -> Array:
@@ -161,7 +161,7 @@ def _placed(scene: Scene, geometry: Geometry) -> Placed:
     turns: list[Array | None] = [None] * len(transforms)
     attributes, normals = [_placed_by(_moved, matrices[:, :3], vertices)], None
     if geometry.normals is not None:
-        turns = [normal_turn(transform) for transform in transforms]
+        turns = [_normal_turn(transform) for transform in transforms]
         own, matrices = [_own_normals(item.mesh) for item in scene.objects], _turns(matrices)
         attributes.append(_placed_by(_turned, matrices, own))
         normals = stored_rows(_known(_in_world(_shortened, matrices, own)))

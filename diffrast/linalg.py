@@ -304,7 +304,7 @@ def transform_directions(matrix: ArrayInput, directions: ArrayInput) -> Float[Ar
 def transform_normals(matrix: ArrayInput, normals: ArrayInput) -> Float[Array, "*batch 3"]:
     """Unit normals (..., 3) of surfaces that an affine 4x4 matrix moves; a zero one stays zero."""
     matrix, normals = _matrix_and_vectors(matrix, "normals", normals)
-    return normalize(apply_matrix(normal_turn(matrix), normals))
+    return normalize(apply_matrix(_normal_turn(matrix), normals))
 
 
 def normal_matrix(matrix: ArrayInput) -> Float[Array, "3 3"]:
@@ -317,7 +317,7 @@ def normal_matrix(matrix: ArrayInput) -> Float[Array, "3 3"]:
     return _cofactors(linear, jnp.max(jnp.abs(linear)))
 
 
-def normal_turn(matrix: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
+def _normal_turn(matrix: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
     """The same for normals that become unit vectors: its derivative leaves out their length."""
     linear = matrix[:3, :3]
     return _cofactors(linear, jax.lax.stop_gradient(jnp.max(jnp.abs(linear))))
