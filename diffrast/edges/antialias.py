@@ -197,7 +197,6 @@ def antialias_image(
     if not view.apart.size:  # faces of one vertex each
         return view.image[1:-1, 1:-1]
     (height, width), channels = view.size, view.image.shape[2]
-    pictured = view.background.ndim == 3
     capacity = ROWS_AT_ONCE * max(4, height * width // (11 * ROWS_AT_ONCE))
     method = Method(shader, glow, cull_backfaces, capacity)
 
@@ -233,7 +232,7 @@ def antialias_image(
 
     def derivative(primals: Any, tangents: Any) -> tuple[tuple[Array, Any], Array]:
         image, positions_clip, background, rest, data = primals
-        d_bare = tangents[2] if pictured else ()
+        d_bare = tangents[2] if view.pictured else ()
         d_image, d_clip, d_bare, _ = without_known_zeros((*tangents[:2], d_bare, tangents[4]))
         # With a derivative of its own: a second one takes the first one of the picture, too.
         out, made_of = recorded(*primals)
@@ -244,7 +243,7 @@ def antialias_image(
             d_means = finish.change(data, found, tangents[4], d_image)
         points = to_pixels(d_clip, height, width).T
         colors = d_image.reshape(-1, channels), d_means.reshape(-1, channels)
-        if pictured:
+        if view.pictured:
             bare = d_bare.reshape(-1, channels)
             colors = jax.tree.map(lambda of_image: jnp.concatenate([of_image, bare]), colors)
         d_out = apply_linear(now, method, records, left, points, colors)
@@ -262,5 +261,5 @@ def antialias_image(
     recorded.defjvp(of_recorded, symbolic_zeros=True)
     data = None if finish is None else finish.data
     # A background of one colour moves with the image, which shows it.
-    background = view.background if pictured else lax.stop_gradient(view.background)
+    background = view.background if view.pictured else lax.stop_gradient(view.background)
     return blended(view.image, view.positions_clip, background, lax.stop_gradient(view), data)

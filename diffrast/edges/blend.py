@@ -58,10 +58,14 @@ class View(NamedTuple):
         return self.image.shape[0] - 2, self.image.shape[1] - 2
 
     @property
+    def pictured(self) -> bool:
+        """Whether the background is a picture."""
+        return self.background.ndim == 3
+
+    @property
     def colors(self) -> int:
         """How many colours pieces part: those of the image, and of a background that is one."""
-        pictured = self.background.ndim == 3
-        return self.face_image.size * (2 if pictured else 1)
+        return self.face_image.size * (2 if self.pictured else 1)
 
 
 class Method(NamedTuple):
@@ -181,13 +185,13 @@ def with_pieces(
     near, behind, inner = stored_together([_colors(view.image, place) for place in places])
     centre, bare = _place(view, pieces.pixel, 4), view.background
     is_bare = found.beyond.face == BACKGROUND
-    if bare.ndim == 1:
-        bare = bare[:, None]
-    else:  # what pixels beside this one show where they are empty is not what is behind this one
+    if view.pictured:  # what empty pixels beside this one show is not what is behind this one
         shown = view.face_image.reshape(-1)[places[1]]
         is_bare = is_bare | ((found.beyond.face < 0) & (shown < 0))
         bare = _colors(bare, centre)
         places[1] = jnp.where(is_bare, view.face_image.size + centre, places[1])
+    else:
+        bare = bare[:, None]
     behind = jnp.where(is_bare, bare, behind)
     front = near
     outward = jnp.where(found.front_on_right, -1, 1)

@@ -141,7 +141,8 @@ def _regards(
     geometry: Geometry,
     points: Points,
 ) -> list[_Regard]:
-    position = stored(positions_at(geometry, points._replace(position=None)))
+    points = points._replace(position=None)  # which is in the world's unit
+    position = stored(positions_at(geometry, points))
     visible = jnp.maximum(points.face, 0)
     regards = []
     for light, view, outside in zip(lights, views, turned, strict=True):
