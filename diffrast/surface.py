@@ -57,7 +57,8 @@ def cast_shadows(
     if shading == "unlit" or not any(map(casts_shadow, scene.lights)):
         return World(scene, camera, geometry, None), (None,) * len(scene.lights)
     neighbors = jnp.asarray(scene_topology(scene).neighbors)
-    shadows, reached = cast(scene.lights, geometry, neighbors, points)
+    by_corner = shading == "gouraud"
+    shadows, reached = cast(scene.lights, geometry, neighbors, points, by_corner)
     return World(scene, camera, geometry, shadows), reached
 
 

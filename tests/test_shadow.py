@@ -34,9 +34,9 @@ WRONG = (0.0005, 0.002)  # share of the points seen: with 512 texels, with few
 # ----------------------------------------------------------------------------------- the lit points
 
 
-def compare(scene, camera):
+def compare(scene, camera, shading="phong", cone=True):
     """Which points are seen, which of them the light reaches, and which it should."""
-    buffers = dr.render_buffers(scene, camera, settings())
+    buffers = dr.render_buffers(scene, camera, settings(shading=shading))
     seen = np.asarray(buffers.face) >= 0
     face, barycentrics = np.asarray(buffers.face)[seen], np.asarray(buffers.barycentrics)[seen]
     barycentrics = np.float64(barycentrics)
@@ -51,6 +51,7 @@ def compare(scene, camera):
     normals = np.float64(buffers.normal)[seen]
     want = np.zeros(seen.shape, bool)
     light = scenes.Oracle(scene, camera.view, camera.projection).lights[0]
+    light = light if cone else {**light, "type": "point"}
     want[seen] = reference.lit(light, points, face, normals, positions, faces)
     return seen, np.asarray(buffers.lit)[..., 0] > 0, want
 
@@ -88,6 +89,25 @@ def test_stairs_as_steep_as_the_light_do_not_shade_themselves(faces, resolution)
     seen, got, want = compare(scene, camera)
     assert want[seen].mean() > 0.999
     assert np.array_equal(got[seen], want[seen])
+
+
+def test_shadows_fall_beyond_the_cone_where_interpolation_carries_its_light():
+    """Of colours of corners, some of which are in the cone of a spot."""
+    place = {"position": (0.5, 3, 1), "direction": (-0.2, -3, -0.8), "cutoff": 0.5}
+    light = dr.SpotLight(**place, diffuse=(1, 1, 1), shadow=dr.Shadow())
+    ground = floor(shapes.plane(8.0, 8.0, divisions=8))
+    scene = dr.Scene(objects=[ball(), ground], lights=[light])
+    plain = replace(scene, lights=(replace(light, shadow=None),))
+    camera = dr.Camera.perspective(eye=(2, 5, 5), target=(0, -1, 0), **FRAME)
+    of_corners, of_points = (
+        np.asarray(dr.render(plain, camera, settings(shading=shading)))[..., 0] > 1e-4
+        for shading in ("gouraud", "phong")
+    )
+    _, got, want = compare(scene, camera, "gouraud", cone=False)
+    beyond = of_corners & ~of_points
+    assert beyond.mean() > 0.1
+    assert np.mean(~want[beyond]) > 0.02
+    assert np.mean(got[of_corners] != want[of_corners]) < WRONG[0]
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])

@@ -44,7 +44,11 @@ class Shadows(NamedTuple):
 
 
 def cast(
-    lights: tuple[Light, ...], geometry: Geometry, neighbors: Int[Array, "F 3"], points: Points
+    lights: tuple[Light, ...],
+    geometry: Geometry,
+    neighbors: Int[Array, "F 3"],
+    points: Points,
+    by_corner: bool = False,
 ) -> tuple[Shadows, Reached]:
     """Take the pictures of the lights that cast shadows, fitted to points.
 
@@ -53,6 +57,7 @@ def cast(
         geometry: of the scene.
         neighbors: of its faces, see `Topology`.
         points: that shadows may fall on.
+        by_corner: whether light falls on the corners of faces, and is interpolated.
 
     Returns:
         The shadows, and what `receive` tells of these points.
@@ -62,7 +67,8 @@ def cast(
     geometry = geometry._replace(positions=geometry.positions / unit)
     casting = [_in_unit(unit, light) for light in lights if casts_shadow(light)]
     with jax.named_scope("shadow"):
-        views = [light_view(light, geometry.positions) for light in casting]
+        corners = geometry.faces if by_corner else None
+        views = [light_view(light, geometry.positions, corners) for light in casting]
         turned = [_turned_to(*both, geometry) for both in zip(casting, views, strict=True)]
         regards = _regards(casting, views, turned, geometry, points)
         windows, plans = zip(

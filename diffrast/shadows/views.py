@@ -21,6 +21,7 @@ from diffrast.linalg import apply_matrix
 from diffrast.viewing import view_axes
 
 _INNER = 0.99  # of the way to the planes near and far: nothing is cut off
+_WIDEST = 8.0  # tangent of the widest angle at which a spot sees
 
 
 class LightView(NamedTuple):
@@ -29,6 +30,7 @@ class LightView(NamedTuple):
     origin: Float[Array, "3"]
     axes: Float[Array, "3 3"]  # across, up and along the light's way; of a point light the world's
     depth: Float[Array, ""]  # key of z = 1 in a parallel projection
+    reach: Float[Array, ""]  # tangent of the angle to its axis at which a spot still sees
 
 
 class Seen(NamedTuple):
@@ -52,21 +54,37 @@ def sides(light: ShiningLight) -> int:
     return 6 if isinstance(light, PointLight) else 1
 
 
-def light_view(light: ShiningLight, positions: Float[Array, "V 3"]) -> LightView:
-    """Place the light, so that its pictures may show any of the positions."""
+def light_view(
+    light: ShiningLight,
+    positions: Float[Array, "V 3"],
+    lit_by_corner: Int[Array, "F 3"] | None = None,
+) -> LightView:
+    """Place the light, so that its pictures may show any of the positions.
+
+    A spot sees what is in its cone, and of faces that are `lit_by_corner` all of those with a
+    corner in the cone, as they carry its light beyond.
+    """
     dtype = positions.dtype
     one = jnp.ones((), dtype)
     if isinstance(light, PointLight):
-        return LightView(light.position, jnp.eye(3, dtype=dtype), one)
+        return LightView(light.position, jnp.eye(3, dtype=dtype), one, one)
     axes = view_axes(light.direction, jnp.zeros(3, dtype)) * jnp.array([1, 1, -1], dtype)[:, None]
     if isinstance(light, SpotLight):
-        return LightView(light.position, axes, one)
+        reach = jnp.tan(light.cutoff)
+        if lit_by_corner is not None:
+            x, y, z = apply_matrix(axes, positions - light.position).T
+            tangent = jnp.hypot(x, y) / jnp.where(z > 0, z, 1)
+            corners = jnp.where(z > 0, tangent, jnp.where(z <= 0, jnp.inf, jnp.nan))[lit_by_corner]
+            lit = jnp.min(corners, axis=1) < reach
+            farthest = jnp.max(jnp.where(lit, jnp.max(corners, axis=1), 0), initial=0)
+            reach = jnp.maximum(reach, jnp.minimum(farthest, _WIDEST))
+        return LightView(light.position, axes, one, reach)
     finite = jnp.all(jnp.isfinite(positions), axis=1, keepdims=True)
     low = jnp.min(jnp.where(finite, positions, jnp.inf), axis=0)
     high = jnp.max(jnp.where(finite, positions, -jnp.inf), axis=0)
     origin = jnp.where(low <= high, (low + high) / 2, 0)
     reach = jnp.max(jnp.abs(apply_matrix(axes[2:], jnp.where(finite, positions - origin, 0))))
-    return LightView(origin, axes, -_INNER / jnp.where(reach > 0, reach, 1))
+    return LightView(origin, axes, -_INNER / jnp.where(reach > 0, reach, 1), one)
 
 
 def see(light: ShiningLight, view: LightView, position: Columns) -> Seen:
@@ -86,8 +104,7 @@ def see(light: ShiningLight, view: LightView, position: Columns) -> Seen:
     inverse = 1 / jnp.where(inside, z, 1)
     x, y = x * inverse, y * inverse
     if isinstance(light, SpotLight):
-        reach = jnp.tan(light.cutoff)
-        inside = inside & (x * x + y * y < reach * reach)
+        inside = inside & (x * x + y * y < view.reach * view.reach)
     return Seen(side, x, y, inverse, inverse, inside)
 
 
