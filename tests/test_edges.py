@@ -296,6 +296,47 @@ def test_where_one_surface_ends_another_may_lie_beyond(eye, error):
     assert np.sqrt(np.mean((image - exact) ** 2)) < error
 
 
+def area_of(corners):
+    x, y = np.moveaxis(np.asarray(corners, float), -1, 0)
+    return abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+
+
+@functools.cache
+def area_of_square_on_the_screen():
+    """Its four corners, in pixels, to the area of 16 × 16 pixels that shows it."""
+
+    @jax.jit
+    def drawn(corners):
+        x, y = corners[:, 0] / 8 - 1, 1 - corners[:, 1] / 8
+        clip = jnp.stack([x, y, 0 * x, jnp.ones_like(x)], axis=1)
+        faces = jnp.array([[0, 1, 2], [0, 2, 3]])
+        face = dr.rasterize(clip, faces, height=16, width=16, border=1).face
+        image = jnp.where(face >= 0, 1.0, 0.0)[..., None]
+        return dr.antialias(image, clip, faces, face)[..., 0]
+
+    return drawn
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        ((3, 3), (11, 3), (11, 12), (3, 12)),
+        ((3, 3.5), (11.25, 3.5), (11.25, 12), (3, 12)),
+        ((5, 5), (6, 5), (6, 6), (5, 6)),
+        ((2, 5), (12, 5), (12, 6), (2, 6)),
+        ((2, 2), (10, 2), (14, 10), (6, 10)),
+        ((8, 2), (14, 8), (8, 14), (2, 8)),
+    ],
+)
+def test_edges_on_borders_between_pixels_belong_to_one_of_these(corners):
+    """Before, such an edge had no derivative."""
+    at, image = np.array(corners, np.float32), area_of_square_on_the_screen()
+    got = jax.grad(lambda corners: image(corners).sum())(at)
+    steps = 1e-3 * np.eye(8).reshape(8, 4, 2)
+    want = [(area_of(at + step) - area_of(at - step)) / 2e-3 for step in steps]
+    np.testing.assert_allclose(np.ravel(got), want, atol=1e-5)
+
+
 def test_needles_that_pierce_a_wall_end_where_they_go_into_it():
     """A triangle that stands alone, of which a strip is seen between its edge and the wall."""
     size, pixel = 32, 2 / 32

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from shadow_scenes import ROUND_THE_CORNER, SIZE, ball, floor, make, settings, sun
+from shadow_scenes import FRAME, ROUND_THE_CORNER, SIZE, ball, floor, make, settings, sun
 
 import diffrast as dr
 from diffrast import linalg, shapes
@@ -73,6 +73,57 @@ def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
         x.reshape(12, 4, 12, 4, 3).mean(axis=(1, 3)) for x in (np.asarray(change), difference)
     ]
     assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
+
+
+def test_outlines_on_ground_of_faces_of_a_pixel_are_those_on_ground_of_two_faces():
+    """Picture and derivative by the lamp; more faces lie in a pixel than are looked at."""
+    grounds = [shapes.plane(2.9, 2.9, divisions=count) for count in (1, 4, 24)]
+    grounds = dr.mesh.stack_meshes(grounds)
+    camera = dr.Camera.perspective(eye=(0.5, 3.0, 4.6), target=(-0.1, -0.4, 0), **FRAME)
+    place = linalg.compose(linalg.translation((0, -0.9, 0)), linalg.rotation_x(-1.5))
+    thing = dr.Object(shapes.icosphere(2, 0.42), transform=linalg.translation((0.3, 0.1, 0.2)))
+
+    @jax.jit
+    def picture_and_derivatives(ground):
+        def picture(position):
+            light = dr.PointLight(position=position, diffuse=(0.8, 0.75, 0.7), shadow=dr.Shadow())
+            scene = dr.Scene(objects=[thing, dr.Object(ground, transform=place)], lights=[light])
+            return dr.render(scene, camera, dr.RenderSettings(height=40, width=40))
+
+        position = jnp.array([1.3, 2.1, 0.9])
+        image, derivative = jax.linearize(picture, position)
+        return image, jax.lax.map(derivative, jnp.eye(3))
+
+    (image, want), *others = (
+        picture_and_derivatives(jax.tree.map(lambda part, k=k: part[k], grounds)) for k in range(3)
+    )
+    for other, got in others:
+        assert np.mean(np.abs(other - image)) < 5e-5
+        assert np.linalg.norm(got - want) < 2e-3 * np.linalg.norm(want)
+
+
+def test_an_outline_on_the_border_between_pixels_belongs_to_one_of_them():
+    """Of a square's shadow, whose upper and lower border lie on borders of rows of pixels."""
+    camera = dr.Camera.orthographic(eye=(0, 0, 20), target=(0, 0, 0), height=16.0, near=1, far=40)
+    rows = [(0, 1, 2), (0, 2, 3)]
+    square = np.array([[-5.7, 4, 4], [-5.7, -4, 4], [-0.9, -4, 4], [-0.9, 4, 4]])
+    black = dr.Material(diffuse=(0, 0, 0))
+    thing = dr.Object(dr.Mesh(vertices=square, faces=rows), black)
+
+    @jax.jit
+    def derivative(across):
+        def picture(across):
+            direction = jnp.array([1.0, 0.0, -1.0]).at[1].set(across)
+            light = dr.DirectionalLight(direction=direction, shadow=dr.Shadow(resolution=64))
+            scene = dr.Scene(objects=[thing, dr.Object(shapes.plane(72, 72))], lights=[light])
+            options = dr.RenderSettings(height=16, width=16, shading="flat")
+            return dr.render(scene, camera, options)[..., 0].sum(axis=1)
+
+        return jax.jvp(picture, (across,), (1.0,))[1]
+
+    on_border, near = np.asarray(derivative(0.0)), np.asarray(derivative(1e-4))
+    for rows in (slice(0, 8), slice(8, 16)):
+        np.testing.assert_allclose(np.sum(on_border[rows]), np.sum(near[rows]), rtol=0.25)
 
 
 def test_outlines_under_a_lens():

@@ -293,7 +293,9 @@ def cut(
         k = _set_bit(segments.runs[segment], run) * length + within
         exists = exists & (k < segments.parts[segment])
     at = stored(segments.ends[..., segment])
-    first, length = stored(_forward(at))
+    first, length = _forward(at)
+    # What runs along a border between two pixels belongs to one of them.
+    first, length = stored((jnp.where(length > 0, first, 0.5), length))
     total = length[0] + length[1]
     middle = (k + 1 - first[0] - first[1]) / jnp.where(total > 0, total, 1)
     cell = stored(jnp.floor(first + jnp.clip(middle, 0, 1) * length))

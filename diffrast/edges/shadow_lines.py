@@ -50,6 +50,7 @@ _ROUNDINGS = 64  # in a line's coefficients
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
+_FLAT = 0.1  # pixels: how far lines on faces that count as one plane may be apart
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
 # Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
@@ -183,11 +184,17 @@ def cross_shadows(
     looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
     first_is_lit = jnp.stack([picked(lit, k) for k in looks[0]])
     looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
-    joined = stored(topology.neighbors[seen[4]].T)
-    joins = counts[4] & (joined >= 0) & cast.turned[light, jnp.maximum(joined, 0)]
-    joins = joins & (cast.patches[jnp.maximum(joined, 0)] == patch[4])
+
+    def beside(face: Array) -> tuple[Array, Array]:
+        """The faces beside each, and whether the surface goes on there, turned to the light."""
+        joined = stored(jnp.moveaxis(topology.neighbors[face], -1, 0))
+        there = jnp.maximum(joined, 0)
+        goes_on = (joined >= 0) & cast.turned[light, there] & (cast.patches[there] == patch[4])
+        return joined, stored(goes_on)
+
+    joined, joins = beside(seen[4])
     near = jnp.concatenate([shown[4:5], joined, shown[_NEAREST[1:]]])
-    falls = jnp.concatenate([counts[4:5], joins, counts[_NEAREST[1:]]])
+    falls = jnp.concatenate([counts[4:5], joins & counts[4], counts[_NEAREST[1:]]])
     which, received = _unlike(near, falls, _FACES)
     ground_face = jnp.stack([picked(near, k) for k in which])
     is_own = received & (ground_face == own)
@@ -210,9 +217,8 @@ def cross_shadows(
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
     tells = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
-    dark_on_right = (above[:, None] > 0) == (ground.offset > 0)
     to_lit = (steps_to(lit_look) - steps_to(dark_look))[:, :, None]
-    lit_on_right = jnp.where(tells[:, None], ~dark_on_right, _dot(normal, to_lit) > 0)
+    lit_on_right = jnp.where(tells[:, None], above[:, None] <= 0, _dot(normal, to_lit) > 0)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
     beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
     # Of an edge that hides something else the line passes elsewhere.
@@ -247,14 +253,14 @@ def cross_shadows(
     side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
-    sign = jnp.where(ground.offset < 0, -1, 1)
-    limits = [sign * _meet(ground, plane) for plane in ends_of]
+    limits = [_meet(ground, plane) for plane in ends_of]
     cut = [jnp.any(meet & chosen, axis=1)[:, None] for meet in meets]
-    borders = _shared(faces, ground_face, received, is_own)
 
     def inside(at: Array) -> list[Array]:
         x, y = at
-        square = [0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y]
+        # What runs along the border between two pixels belongs to one of them.
+        right, below = (jnp.where(room == 0, -tiny, room) for room in (0.5 - x, 0.5 - y))
+        square = [right, 0.5 + x, below, 0.5 + y]
         ends_here = [
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
@@ -263,12 +269,20 @@ def cross_shadows(
             jnp.where(ends_others[:, k, None], side * (way[0] * x + way[1] * y - least), 1)
             for k, (way, least) in enumerate(zip(outwards.swapaxes(0, 1), beyond, strict=True))
         ]
-        values, _ = edge_values(corners[:, :, None], x, y, near=(zero, zero))
-        on_face = [jnp.where(*part, 1) for part in zip(borders, values, strict=True)]
-        return square + ends_here + others + on_face
+        return square + ends_here + others
 
-    zero = jnp.zeros_like(source[0])
-    low, high = positive_part(inside(foot - along), inside(foot + along))
+    zero, tiny = jnp.zeros_like(source[0]), jnp.finfo(source.dtype).tiny
+    both_ends = foot - along, foot + along
+    in_pixel = positive_part(*map(inside, both_ends))
+    values = [edge_values(corners[:, :, None], x, y, near=(zero, zero))[0] for x, y in both_ends]
+    _, goes_on = beside(ground_face)
+    ends_there = [
+        [jnp.where(on, 1, v) for on, v in zip(goes_on, end, strict=True)] for end in values
+    ]
+    on_face, on_surface = positive_part(*values), positive_part(*ends_there)
+    low, high = _continued(
+        _common(in_pixel, on_face), _common(in_pixel, on_surface), usable, foot, along
+    )
     drawn = (chosen[:, None] & usable & (low < high)).reshape(_EDGES * _FACES, -1)
     lines, total = selected(drawn)
     return Outlines(
@@ -302,17 +316,48 @@ def _unlike(values: Array, used: Array, count: int) -> tuple[Int[Array, "count n
     return stored_together((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
 
 
-def _shared(faces: Array, face: Array, exists: Array, is_own: Array) -> list[Array]:
-    """Beyond which of three edges of faces the shadow falls on another one of these.
+def _common(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    """What parts of lines have in common, from begin to end."""
+    return jnp.maximum(one[0], other[0]), jnp.minimum(one[1], other[1])
 
-    Beyond each, but for the pixel's own face, which stands for those that are not known.
+
+def _continued(
+    own: tuple[Array, Array],
+    room: tuple[Array, Array],
+    usable: Bool[Array, "edges faces n"],
+    foot: Float[Array, "2 edges faces n"],
+    along: Float[Array, "2 edges faces n"],
+) -> tuple[Array, Array]:
+    """Begins and ends of lines on faces, 0 to 1, where other faces are not known.
+
+    What is not on its `own` face goes on in that face's plane, as far as there is `room`, before
+    the first one of the faces and behind each up to the next.
     """
-    corners = stored(faces.T[:, jnp.maximum(face, 0)])  # (3, rows, n)
-    other = exists & ~is_own
-    has = jnp.any(corners[:, None, :, None] == corners[None, :, None], axis=1) & other
-    count = face.shape[0]
-    has = has & ~jnp.eye(count, dtype=bool)[..., None]  # (3, rows, other rows, n)
-    return [~is_own | jnp.any(has[(k + 1) % 3] & has[(k + 2) % 3], axis=1) for k in range(3)]
+    low, high = own
+    here = usable & (low < high)
+    axis = along[:, :, :1]
+    step, at = _dot(along, axis), _dot(foot, axis)
+    begin, end = (at + (2 * part - 1) * step for part in own)
+    middle = jnp.where(here, begin + end, jnp.inf)
+    order = jnp.arange(_FACES)[:, None, None]
+    one, other = middle[:, :, None], middle[:, None]
+    later = here[:, None] & (
+        (other > one) | ((other == one) & (jnp.arange(_FACES)[:, None] > order))
+    )
+    following = jnp.min(jnp.where(later, begin[:, None], jnp.inf), axis=2)
+    first = here & (jnp.sum(later, axis=2) == jnp.sum(here, axis=1, keepdims=True) - 1)
+    alike = step > 0.5 * _dot(axis, axis)  # in direction
+    up_to = ((following - at) / jnp.where(alike, step, 1) + 1) / 2
+    longer = jnp.maximum(high, jnp.minimum(room[1], up_to))
+    # Where it is on none, but all of these are one plane, or nearly: in the first.
+    apart = [
+        _cross(along, foot[:, :, :1] + sign * along[:, :, :1] - foot) / _REACH for sign in (1, -1)
+    ]
+    flat = jnp.all(~usable | (jnp.maximum(*map(jnp.abs, apart)) < _FLAT), axis=1, keepdims=True)
+    alone = flat & ~jnp.any(here, axis=1, keepdims=True) & (jnp.arange(_FACES)[:, None] == 0)
+    low = jnp.where((first & alike) | alone, room[0], low)
+    high = jnp.where(here & alike, longer, jnp.where(alone, room[1], high))
+    return stored((low, high))
 
 
 @jax.jit
@@ -429,6 +474,10 @@ def _dot(a: Array, b: Array) -> Array:
     return reduce(add, [x * y for x, y in zip(a, b, strict=True)])
 
 
+def _cross(a: Array, b: Array) -> Array:
+    return a[0] * b[1] - a[1] * b[0]
+
+
 def _nonzero(value: Array) -> Array:
     return jnp.where(value == 0, 1, value)
 
@@ -447,8 +496,11 @@ def _through(normal: Array, place: Array) -> _Plane:
 
 
 def _face_plane(corners: Float[Array, "3 3 *n"]) -> _Plane:
+    """The plane of faces; its offset is not negative."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    return _through(cross_rows(b - a, c - a), a)
+    plane = _through(cross_rows(b - a, c - a), a)
+    sign = jnp.where(plane.offset < 0, -1, 1)
+    return _Plane(sign * plane.normal, sign * plane.offset)
 
 
 def _shadow_plane(source: Array, weight: Array, start: Array, end: Array) -> _Plane:
