@@ -111,6 +111,48 @@ def test_photographs_are_turned_upright(tmp_path):
     assert image[10:].max() < 0.1
 
 
+def test_photographs_of_sixteen_bits_are_turned_upright(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    values = RNG.integers(0, 65536, (2, 3, 4)).astype(np.uint16)
+    turned = np.rot90(values, -1) / 65535
+    block = b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0")
+    chunk = struct.pack(">I", len(block) - 4) + block + struct.pack(">I", zlib.crc32(block))
+    for channels, wanted in (
+        (1, turned[..., [0, 0, 0]]),
+        (2, turned[..., [0, 0, 0, 1]]),
+        (3, turned[..., :3]),
+        (4, turned),
+    ):
+        path = tmp_path / f"{channels}.png"
+        write_png16(path, values[..., :channels])
+        content = path.read_bytes()
+        path.write_bytes(content[:33] + chunk + content[33:])  # behind the header
+        np.testing.assert_allclose(load_image(path, srgb=False), wanted, rtol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_one_colour_of_sixteen_bits_may_be_transparent(tmp_path, channels):
+    values = RNG.integers(0, 65536, (2, 3, channels))
+    write_png16(tmp_path / "clear.png", values)
+    block = b"tRNS" + values[0, 1].astype(">u2").tobytes()
+    chunk = struct.pack(">I", len(block) - 4) + block + struct.pack(">I", zlib.crc32(block))
+    content = (tmp_path / "clear.png").read_bytes()
+    (tmp_path / "clear.png").write_bytes(content[:33] + chunk + content[33:])
+    image = np.asarray(load_image(tmp_path / "clear.png", srgb=False))
+    np.testing.assert_allclose(image[..., :3] * 65535, values * np.ones(3), rtol=1e-6)
+    np.testing.assert_array_equal(image[..., 3], [[1, 0, 1], [1, 1, 1]])
+
+
+def test_other_files_of_sixteen_bits(tmp_path):
+    values = RNG.integers(0, 65536, (2, 3)).astype(np.uint16)
+    (tmp_path / "a.pgm").write_bytes(b"P5 3 2 65535\n" + values.astype(">u2").tobytes())
+    Image.frombytes("I;16B", (3, 2), values.astype(">u2").tobytes()).save(tmp_path / "a.tif")
+    for name in ("a.pgm", "a.tif"):
+        image = np.asarray(load_image(tmp_path / name, srgb=False))
+        np.testing.assert_allclose(image * 65535, values[..., None] * np.ones(3), rtol=1e-6)
+
+
 def test_animations(tmp_path):
     images = RNG.uniform(size=(3, 4, 5, 1)) * np.ones(3)
     save_animation(tmp_path / "a.gif", images, frames_per_second=12.5)
@@ -169,12 +211,26 @@ def test_missing_files_and_folders(tmp_path):
         (np.zeros((0, 2, 3)), "a.png", "image: wanted shape"),
         (np.zeros((2, 2, 3)), "a.what", r"a\.what: cannot be written as an image"),
         (np.zeros((2, 2, 4)), "a.jpg", r"a\.jpg: cannot be written as an image"),
+        (
+            np.zeros((2, 2, 4)),
+            "a.bmp",
+            r"a\.bmp: cannot be written .*BMP holds no alpha",
+        ),
+        (np.zeros((2, 2, 3)), "a.psd", r"a\.psd: cannot be written as an image"),
     ],
 )
 def test_what_cannot_be_saved(tmp_path, image, name, message):
     with pytest.raises(ValueError, match=message):
         save_image(tmp_path / name, image)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_saved_leaves_the_file_that_is_there(tmp_path):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"a good picture")
+    with pytest.raises(ValueError, match="cannot be written as an image"):
+        save_image(path, np.zeros((2, 2, 4)))
+    assert path.read_bytes() == b"a good picture"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Images in and out, through Pillow: linear RGB here, sRGB in the file."""
 
+import io
 from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
@@ -15,6 +16,7 @@ from diffrast._check import ArrayInput, file_path, flag, float_array, iterable, 
 from diffrast.color import linear_to_srgb, srgb_to_linear
 
 _LONGEST = 0xFFFF  # time of a GIF's frame, in 1/100 s
+_OPAQUE = (".bmp", ".dib")  # to which Pillow writes an alpha that nobody reads
 
 
 def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height width channels"]:
@@ -36,19 +38,12 @@ def load_image(path: str | Path, *, srgb: bool = True) -> Float32[Array, "height
     """
     path, srgb = file_path("path", path), flag("srgb", srgb)
     try:
-        with Image.open(path) as image:
-            check_picture(image)
-            values = _deep_channels(image, path)
-            if values is None:
-                values = _channels(ImageOps.exif_transpose(image))
+        content = path.read_bytes()
     except FileNotFoundError:
         raise
-    except Exception as error:  # Pillow's readers fail in any way: SyntaxError, struct.error, ...
+    except OSError as error:  # a folder, say
         raise ValueError(f"{path}: cannot be read as an image ({error})") from error
-    if srgb:
-        color = srgb_to_linear(values[..., :3])
-        return jnp.concatenate([color, values[..., 3:]], axis=-1)
-    return jnp.asarray(values)
+    return jnp.asarray(decoded_picture(content, str(path), srgb=srgb))
 
 
 def save_image(path: str | Path, image: ArrayInput, *, srgb: bool = True) -> None:
@@ -62,7 +57,8 @@ def save_image(path: str | Path, image: ArrayInput, *, srgb: bool = True) -> Non
 
     Raises:
         ValueError: for other shapes, whole numbers (which would be 0 to 255, not 0 to 1), NaN and
-            infinity, and formats that Pillow cannot write.
+            infinity, and formats that Pillow cannot write, or only without the alpha given. A
+            file of that name that was there is then still there.
         FileNotFoundError: for a folder that is not there.
     """
     path, srgb = file_path("path", path), flag("srgb", srgb)
@@ -116,6 +112,30 @@ def save_animation(
     _write(path, [Image.fromarray(f) for f in frames], save_all=True, duration=duration, loop=0)
 
 
+def decoded_picture(
+    content: bytes, name: str, *, srgb: bool = True
+) -> Float32[np.ndarray, "height width channels"]:
+    """The picture that a file's content is, as `load_image` reads it.
+
+    Raises:
+        ValueError: with `name`, for anything else.
+    """
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            check_picture(image)
+            values = _deep_channels(image, content)
+            if values is None:
+                values = _channels(ImageOps.exif_transpose(image))
+    except Exception as error:  # Pillow's readers fail in any way: SyntaxError, struct.error, ...
+        raise ValueError(f"{name}: cannot be read as an image ({error})") from error
+    if srgb:
+        values[..., :3] = srgb_to_linear(values[..., :3])
+    return values
+
+
+# --------------------------------------------------------------------------------------- details
+
+
 def check_picture(image: Image.Image) -> None:
     """Refuse pictures that are dangerous to decode, before any of their pixels are.
 
@@ -141,34 +161,39 @@ def _channels(image: Image.Image) -> Float32[np.ndarray, "height width channels"
 
 
 def _deep_channels(
-    image: ImageFile.ImageFile, path: Path
+    image: ImageFile.ImageFile, content: bytes
 ) -> Float32[np.ndarray, "height width channels"] | None:
     """RGB or RGBA of an image of 16 bits a channel; None for any other.
 
     Pillow keeps 16 bits of grey only. Of PNG colours it drops the lower byte; read as if the bytes
     stood the other way round it drops the upper one.
     """
-    if image.mode == "I;16" or (image.mode == "I" and image.format == "PNG"):
-        grey = np.asarray(image)[..., None]
-        return _unit(np.repeat(grey, 3, axis=-1), 65535)
     raw_mode = image.tile[0][3] if image.format == "PNG" and image.tile else ""
-    if "transparency" in image.info or raw_mode not in ("RGB;16B", "RGBA;16B", "LA;16B"):
-        return None
-    if raw_mode == "LA;16B":  # four bytes a pixel, as 8-bit RGBA has
-        grey_high, grey_low, alpha_high, alpha_low = np.moveaxis(_decode(path, "RGBA"), -1, 0)
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
+        values = np.asarray(ImageOps.exif_transpose(image))[..., None]
+    elif raw_mode == "LA;16B":  # four bytes a pixel, as 8-bit RGBA has
+        grey_high, grey_low, alpha_high, alpha_low = np.moveaxis(_decode(content, "RGBA"), -1, 0)
         high = np.stack([grey_high, grey_high, grey_high, alpha_high], axis=-1)
         low = np.stack([grey_low, grey_low, grey_low, alpha_low], axis=-1)
+        values = high.astype(np.uint16) * 256 + low
+    elif raw_mode in ("RGB;16B", "RGBA;16B"):
+        high, low = (_decode(content, mode) for mode in (raw_mode, raw_mode.replace("16B", "16L")))
+        values = high.astype(np.uint16) * 256 + low
     else:
-        high, low = _decode(path, raw_mode), _decode(path, raw_mode.replace("16B", "16L"))
-    return _unit(high.astype(np.uint16) * 256 + low, 65535)
+        return None
+    color = np.repeat(values, 3, axis=-1) if values.shape[-1] == 1 else values
+    if "transparency" in image.info:  # the one colour that is not opaque
+        opaque = np.any(values != image.info["transparency"], axis=-1, keepdims=True)
+        color = np.concatenate([color, opaque * np.uint16(65535)], axis=-1)
+    return _unit(color, 65535)
 
 
-def _decode(path: Path, raw_mode: str) -> UInt8[np.ndarray, "height width channels"]:
+def _decode(content: bytes, raw_mode: str) -> UInt8[np.ndarray, "height width channels"]:
     """Pixels of a PNG, its bytes understood as `raw_mode`."""
-    with Image.open(path) as image:
+    with Image.open(io.BytesIO(content)) as image:
         tiles: Any = [(*tile[:3], raw_mode) for tile in image.tile]
         image.tile = tiles
-        return np.array(image)
+        return np.array(ImageOps.exif_transpose(image))
 
 
 def _unit(values: np.ndarray, full: int) -> np.ndarray:
@@ -194,13 +219,17 @@ def _to_bytes(name: str, image: ArrayInput, srgb: bool) -> UInt8[np.ndarray, "he
 
 
 def _write(path: Path, frames: list[Image.Image], **options: Any) -> None:
+    """Write a file as a whole: one that is there stays as it is until the new one is encoded."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist")
     if len(frames) > 1:
         options["append_images"] = frames[1:]
+    encoded = io.BytesIO()
+    encoded.name = str(path)  # by which Pillow knows the format
     try:
-        frames[0].save(path, **options)
-    except (ValueError, OSError) as error:
-        if getattr(error, "errno", None) is not None:  # a full disk is no matter of values
-            raise
+        if path.suffix.lower() in _OPAQUE and frames[0].mode == "RGBA":
+            raise ValueError("BMP holds no alpha")
+        frames[0].save(encoded, **options)
+    except (ValueError, OSError, KeyError) as error:  # KeyError: a format that is only read
         raise ValueError(f"{path}: cannot be written as an image ({error})") from error
+    path.write_bytes(encoded.getbuffer())
