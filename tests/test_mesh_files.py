@@ -131,6 +131,11 @@ def test_obj_syntax_that_other_programs_write(tmp_path):
     np.testing.assert_array_equal(read.normals, np.tile([0, 0, 1], (3, 1)))
 
 
+def test_obj_may_end_in_a_backslash(tmp_path):
+    read = load_mesh(write(tmp_path / "a.obj", QUAD + "f 1 2 3\nf 1 3 4 \\"))
+    np.testing.assert_array_equal(read.faces, [[0, 1, 2], [0, 2, 3]])
+
+
 def test_obj_attributes_of_some_faces_only_are_left_out(tmp_path):
     text = QUAD + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1\n"
     read = load_mesh(write(tmp_path / "a.obj", text))
@@ -190,6 +195,181 @@ def test_materials_and_textures(tmp_path):
     np.testing.assert_array_equal(load_mesh(path).faces, [[0, 1, 2], [0, 2, 3]])
     (tmp_path / "m.mtl").unlink()
     assert all(part.diffuse is None for part in load_mesh_parts(path))
+
+
+TRIANGLE = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl one\n"
+TRIANGLE += "f 1/1 2/2 3/3\n"
+
+
+def one_material(tmp_path, lines):
+    """The part of a triangle whose material has these lines."""
+    write(tmp_path / "m.mtl", f"newmtl one\n{lines}\n")
+    (part,) = load_mesh_parts(write(tmp_path / "a.obj", TRIANGLE))
+    return part
+
+
+@pytest.mark.parametrize("material", ["", "usemtl missing\n"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".gltf", ".glb"])
+def test_uvs_without_a_material_bring_none(tmp_path, suffix, material):
+    path = tmp_path / f"a{suffix}"
+    save_mesh(path, shapes.plane())
+    assert b"PNG" not in path.read_bytes()
+    if suffix == ".obj":
+        path.write_text(material + path.read_text())
+    (part,) = load_mesh_parts(path)
+    assert part[2:] == (None,) * 7
+    (item,) = load_objects(path)
+    assert item.mesh.uvs is not None
+    assert item.material.texture is None
+    np.testing.assert_array_equal(item.material.diffuse, dr.Material().diffuse)
+
+
+def test_obj_materials_may_differ_in_what_their_corners_have(tmp_path):
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "t.png")
+    write(tmp_path / "m.mtl", "newmtl plain\nKd 1 0 0\nnewmtl full\nmap_Kd t.png\n")
+    text = "mtllib m.mtl\n" + QUAD + "v 0 0 9\nvt 0 0\nvt 1 0\nvt 1 1\nvn 1 0 0\n"
+    text += "usemtl plain\nf 1 2 3\nusemtl full\nf 1/1/1 3/3/1 4/2/1\nusemtl plain\nf 1 3 4\n"
+    path = write(tmp_path / "a.obj", text)
+    plain, full = load_mesh_parts(path)
+    assert (plain.mesh.uvs, plain.mesh.normals) == (None, None)
+    np.testing.assert_array_equal(corners(full.mesh, "uvs"), [[[0, 0], [1, 1], [1, 0]]])
+    np.testing.assert_array_equal(full.mesh.normals, np.tile([1, 0, 0], (3, 1)))
+    assert full.texture is not None
+    read = load_mesh(path)  # its faces in their order
+    np.testing.assert_array_equal(corners(read)[:, 1], [[1, 0, 0], [1, 1, 0], [1, 1, 0]])
+    np.testing.assert_array_equal(corners(read, "uvs")[::2], np.zeros((2, 3, 2)))
+    np.testing.assert_array_equal(corners(read, "uvs")[1], [[0, 0], [1, 1], [1, 0]])
+    z = [0, 0, 1]
+    np.testing.assert_array_equal(corners(read, "normals")[:, 0], [z, [1, 0, 0], z])
+
+
+@pytest.mark.parametrize(
+    ("line", "color"),
+    [
+        ("Kd 1 .5 0 # red", (1, 0.5, 0)),
+        ("Kd 1 \\\n .5 0", (1, 0.5, 0)),
+        ("kd .5", (0.5, 0.5, 0.5)),
+        ("Kd 1 2", "wanted 1 or 3 numbers after Kd, got '1 2'"),
+        ("Kd 1 2 x", "wanted 1 or 3 numbers after Kd, got '1 2 x'"),
+        ("Kd nan 0 0", "wanted 1 or 3 numbers after Kd, got 'nan 0 0'"),
+        ("Kd 1e39 0 0", "wanted 1 or 3 numbers after Kd, got '1e39 0 0'"),
+        ("Kd spectral a.rfl", "wanted 1 or 3 numbers after Kd, got 'spectral a.rfl'"),
+        ("Ns 1 2", "wanted 1 number after Ns, got '1 2'"),
+    ],
+)
+def test_mtl_colours(tmp_path, line, color):
+    if isinstance(color, str):
+        with pytest.raises(ValueError, match=f"a.obj: m.mtl:2: {color}"):
+            one_material(tmp_path, line)
+    else:
+        np.testing.assert_array_equal(one_material(tmp_path, line).diffuse, color)
+
+
+def test_mtl_colours_belong_to_a_material(tmp_path):
+    write(tmp_path / "m.mtl", "Kd 1 0 0\nnewmtl one\n")
+    with pytest.raises(ValueError, match=r"a\.obj: m\.mtl:1: wanted newmtl before Kd, got none"):
+        load_mesh_parts(write(tmp_path / "a.obj", TRIANGLE))
+
+
+@pytest.mark.parametrize(
+    "name", ["t 1.png", "t 1.png # c", "t 1.png #c", r"a\t 1.png", r"C:\a\t 1.png", "a/t%201.png"]
+)
+def test_names_of_textures(tmp_path, name):
+    Image.fromarray(np.full((1, 1, 3), 255, np.uint8)).save(tmp_path / "t 1.png")
+    np.testing.assert_array_equal(one_material(tmp_path, f"map_Kd {name}").texture, [[[1, 1, 1]]])
+
+
+def test_mtl_options_of_textures(tmp_path):
+    Image.fromarray(np.full((1, 1, 3), 255, np.uint8)).save(tmp_path / "-mm.png")
+    part = one_material(tmp_path, "map_Kd -clamp on -o .5 -s 2 3 1 -mm.png")
+    assert part.wrap == ("clamp", "clamp")
+    np.testing.assert_array_equal(part.texture, [[[1, 1, 1]]])
+    np.testing.assert_array_equal(corners(part.mesh, "uvs"), [[[0.5, 0], [2.5, 0], [0.5, 3]]])
+    assert one_material(tmp_path, "map_Kd -clamp off -mm.png").wrap == ("repeat", "repeat")
+    assert one_material(tmp_path, "map_Kd").texture is None
+    for option in ("-mm 0 1", "-clamp maybe", "-s x", "-blendu on"):
+        with pytest.raises(ValueError, match=f"m.mtl:2: wanted a picture after .* got '{option} t"):
+            one_material(tmp_path, f"map_Kd {option} t.png")
+
+
+@pytest.mark.parametrize("libraries", ["mtllib m.mtl b.mtl", "mtllib m.mtl\nmtllib b.mtl # c"])
+def test_several_material_files_and_names_with_a_hash(tmp_path, libraries):
+    write(tmp_path / "m.mtl", "newmtl one\nKd 1 0 0\n")
+    more = "newmtl one\nKd 0 0 0\nnewmtl Mat #2\nKd 0 1 0\nnewmtl Mat #3 # c\nKd 0 0 1\n"
+    write(tmp_path / "b.mtl", more)
+    text = f"{libraries}\n{QUAD}usemtl one #c\nf 1 2 3\nusemtl Mat #2\nf 1 2 3\nusemtl Mat #3\n"
+    parts = load_mesh_parts(write(tmp_path / "a.obj", text + "f 1 2 3\n"))
+    np.testing.assert_array_equal([part.diffuse for part in parts], np.eye(3))
+    assert [part.name for part in parts] == ["one #c", "Mat #2", "Mat #3"]
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "gltf", "embedded"])
+def test_textures_are_read_as_pictures_are(tmp_path, kind):
+    """16 bits of grey are kept; what is no picture is an error that says so."""
+    values = np.array([[0, 10000, 20000], [40000, 50000, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / "deep.png")
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+
+    def texture(name):
+        if kind == "obj":
+            return one_material(tmp_path, f"map_Kd {name}").texture
+        if kind == "ply":
+            save_mesh(tmp_path / "a.ply", shapes.plane())
+            line = f"1.0\ncomment TextureFile {name}\n".encode()
+            content = (tmp_path / "a.ply").read_bytes().replace(b"1.0\n", line, 1)
+            (tmp_path / "a.ply").write_bytes(content)
+            return load_mesh_parts(tmp_path / "a.ply")[0].texture
+        tree = gltf_tree(tmp_path)
+        tree["images"] = [{"uri": name}]
+        if kind == "embedded":
+            content = (tmp_path / name).read_bytes()
+            uri = f"data:image/png;base64,{base64.b64encode(content).decode()}"
+            tree["buffers"].append({"uri": uri, "byteLength": len(content)})
+            tree["bufferViews"].append(
+                {"buffer": len(tree["buffers"]) - 1, "byteLength": len(content)}
+            )
+            tree["images"] = [{"bufferView": len(tree["bufferViews"]) - 1}]
+        return load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))[0].texture
+
+    np.testing.assert_array_equal(texture("deep.png"), dr.load_image(tmp_path / "deep.png"))
+    with pytest.raises(ValueError, match=r"a\..*: cannot be read as an image"):
+        texture("broken.png")
+    if kind != "embedded":
+        assert texture("none.png") is None
+
+
+def test_ply_of_several_textures_is_refused(tmp_path):
+    lines = "comment TextureFile a.png\ncomment TextureFile b.png\nelement vertex"
+    path = write(tmp_path / "a.ply", PLY.replace("element vertex", lines, 1) + "0 0 0\n" * 3)
+    with pytest.raises(ValueError, match=r"a\.ply: wanted one TextureFile, got 'a.png b.png'"):
+        load_mesh_parts(path)
+
+
+def test_gltf_names_of_files_may_be_percent_encoded(tmp_path):
+    tree = gltf_tree(tmp_path)
+    (tmp_path / "t.png").rename(tmp_path / "ü t.png")
+    (tmp_path / "b 1.bin").write_bytes(
+        base64.b64decode(tree["buffers"][0]["uri"].partition("base64,")[2])
+    )
+    tree["images"], tree["buffers"][0]["uri"] = [{"uri": "%C3%BC%20t.png"}], "b%201.bin"
+    (item,) = load_objects(write(tmp_path / "a.gltf", json.dumps(tree)))
+    assert item.material.texture is not None
+
+
+def test_gltf_colours_keep_their_digits(tmp_path):
+    tree = gltf_tree(tmp_path)
+    base = tree["materials"][0]["pbrMetallicRoughness"]
+    base["baseColorFactor"] = [0.5, 0.001, 1.0, 0.5]
+    (part,) = load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))
+    np.testing.assert_array_equal(part.diffuse, np.float32([0.5, 0.001, 1.0]))
+    old = {"diffuseFactor": [0.25, 0, 1, 1], "diffuseTexture": {"index": 0}}
+    tree["materials"] = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": old}}]
+    (part,) = load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))
+    np.testing.assert_array_equal(part.diffuse, [0.25, 0, 1])
+    np.testing.assert_allclose(part.texture, [[[1, 0, 0], [0, 0.502886, 0]]], atol=1e-5)
+    old["diffuseFactor"] = [1, "x", 1]
+    with pytest.raises(ValueError, match=r"materials\[0\]: wanted 3 or 4 numbers as a base colour"):
+        load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))
 
 
 def test_objects_of_a_file_carry_its_materials(tmp_path):

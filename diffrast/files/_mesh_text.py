@@ -1,9 +1,10 @@
 """What the mesh reader passes over in silence: the lines of text formats, checked one by one.
 
 trimesh counts OBJ's relative indices from the end of the file instead of from the face, takes the
-first vertex for index 0, and does not say where a file is broken. Of OFF files, read here, it
-reorders polygons, and drops normals and texture coordinates. Each check here raises `ValueError`
-"file:line: wanted ..., got ...".
+first vertex for index 0, drops texture coordinates and normals of all corners where one has none,
+and does not say where a file is broken. Of OFF files, read here, it reorders polygons, and drops
+normals and texture coordinates. Each check here raises `ValueError` "file:line: wanted ..., got
+...".
 """
 
 import math
@@ -20,7 +21,11 @@ from diffrast._tokens import decoded
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
 _WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
 _OFF = re.compile(r"(?P<uv>ST)?(?P<color>C)?(?P<normal>N)?(?P<weight>4)?OFF")
+_COMMENT = re.compile(r"(?:^|\s)#(?=\s|$)")  # behind a name, which may have a # itself
 _END_OF_LINE = re.compile(r"\r\n|\r|\n")  # not those that `str.splitlines` finds in letters
+
+
+_ObjFace = tuple[int, str | None, list[list[int]]]  # line, material, corners
 
 
 def text_of(content: bytes, name: str) -> str:
@@ -31,51 +36,100 @@ def text_of(content: bytes, name: str) -> str:
     return decoded(content)
 
 
-def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> str:
-    """The geometry of an OBJ file in its plainest form, checked.
+class PlainObj(NamedTuple):
+    """The geometry of an OBJ file in its plainest form.
+
+    Attributes:
+        text: an OBJ file of vertices and triangles, and of `usemtl` with a number.
+        materials: the names that these numbers stand for; None for faces of no material.
+        libraries: what follows `mtllib` on each line.
+    """
+
+    text: str
+    materials: list[str | None]
+    libraries: list[str]
+
+
+def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> PlainObj:
+    """An OBJ file, checked.
 
     Triangles only (polygons as fans), indices from the start of the file, one blank between
-    words, the same kind of corner (v, v/vt, v//vn, v/vt/vn) everywhere: texture coordinates and
-    normals are kept where all corners have them. Groups, objects, lines and colours are dropped.
+    words, the same kind of corner (v, v/vt, v//vn, v/vt/vn) wherever a material is: texture
+    coordinates and normals are kept where all its corners have them. Groups, objects, lines and
+    colours are dropped. Without `keep_materials` numbers only part faces with unlike corners, and
+    those stay in their order.
     """
     counts = dict.fromkeys(_OBJ_SIZES, 0)
     vertices: list[str] = []
-    faces: list[tuple[int, list[list[int]]] | str] = []
-    for line, words in _obj_lines(text):
+    faces: list[_ObjFace] = []
+    libraries: list[str] = []
+    material = None
+    for line, words in statements(text, ("mtllib", "usemtl")):
         key = words[0]
         if key in counts:
             counts[key] += 1
             vertices.append(" ".join([key, *_obj_numbers(words, f"{name}:{line}")]))
         elif key == "f":
-            faces.append((line, _obj_corners(words[1:], counts, f"{name}:{line}")))
-        elif keep_materials and key in ("mtllib", "usemtl"):
-            faces.append(" ".join(words))
-    corners = [corner for face in faces if not isinstance(face, str) for corner in face[1]]
-    kind = (all(corner[1] for corner in corners), all(corner[2] for corner in corners))
-    lines = []
-    for face in faces:
-        if isinstance(face, str):
-            lines.append(face)
-            continue
-        _obj_in_range(face, counts, name)
-        written = [_obj_corner(corner, kind) for corner in face[1]]
+            faces.append((line, material, _obj_corners(words[1:], counts, f"{name}:{line}")))
+        elif key == "mtllib":
+            libraries += words[1:]
+        elif key == "usemtl":
+            material = words[1] if len(words) > 1 else None
+    kinds = _obj_kinds(faces)
+    materials: dict[str | None, int] = {}
+    lines: list[str] = []
+    number, last = -1, None
+    for line, material, corners in faces:
+        kind = kinds[material]
+        if keep_materials:
+            wanted = materials.setdefault(material, len(materials))
+        else:
+            wanted = number + (kind != last)
+        if wanted != number:
+            lines.append(f"usemtl {wanted}")
+        number, last = wanted, kind
+        _obj_in_range(line, corners, counts, name)
+        written = [_obj_corner(corner, kind) for corner in corners]
         lines += [f"f {written[0]} {b} {c}" for b, c in pairwise(written[1:])]
-    return "\n".join([*vertices, *lines, ""])
+    return PlainObj("\n".join([*vertices, *lines, ""]), list(materials), libraries)
 
 
-def _obj_lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Words of every line that has any, with the number of its first line."""
+def statements(text: str, names: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
+    """Words of every line that has any, with the number of its first line.
+
+    After one of `names`, in small letters, the rest of a line is one word: in it only a # that
+    stands alone begins a comment.
+    """
     pending, first = "", 0
-    for number, line in enumerate(_lines(text), start=1):
+    for number, line in enumerate([*_lines(text), ""], start=1):  # the last may end in a backslash
         first = first if pending else number
-        content = pending + line.split("#")[0]
+        content = pending + line
+        if "#" in content:
+            is_name = content.split(None, 1)[0].lower() in names
+            content = _COMMENT.split(content)[0] if is_name else content.partition("#")[0]
         if content.endswith("\\"):
             pending = content[:-1] + " "
             continue
         pending = ""
-        words = content.split()
-        if words:
-            yield first, words
+        words = content.split(None, 1)
+        if not words:
+            continue
+        if words[0].lower() in names:
+            yield first, [word.rstrip() for word in words]
+        else:
+            yield first, content.split()
+
+
+def _obj_kinds(faces: list[_ObjFace]) -> dict[str | None, tuple[bool, bool]]:
+    """Whether all corners of each material have texture coordinates, and normals."""
+    kinds: dict[str | None, tuple[bool, bool]] = {}
+    for _, material, corners in faces:
+        uv, normal = kinds.get(material, (True, True))
+        kinds[material] = (
+            uv and all(corner[1] for corner in corners),
+            normal and all(corner[2] for corner in corners),
+        )
+    return kinds
 
 
 def _obj_numbers(words: list[str], where: str) -> list[str]:
@@ -110,12 +164,12 @@ def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[l
     return corners
 
 
-def _obj_in_range(face: tuple[int, list[list[int]]], counts: dict[str, int], name: str) -> None:
+def _obj_in_range(line: int, corners: list[list[int]], counts: dict[str, int], name: str) -> None:
     for k, (key, count) in enumerate(counts.items()):
-        for corner in face[1]:
+        for corner in corners:
             if (index := corner[k]) > count:
                 raise ValueError(
-                    f"{name}:{face[0]}: wanted an index of at most {count}, the number of {key} in"
+                    f"{name}:{line}: wanted an index of at most {count}, the number of {key} in"
                     f" the file, got {index}"
                 )
 

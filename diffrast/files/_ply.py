@@ -29,6 +29,7 @@ _CODES = {  # as struct and numpy know them
     "float": "f", "double": "d",
 }  # fmt: skip
 _INDICES = ("vertex_indices", "vertex_index")
+_TEXTURE = re.compile(r"^[ \t]*comment[ \t]+texturefile[ \t]+(.+)$", re.MULTILINE | re.IGNORECASE)
 _END = re.compile(rb"^end_header[^\n]*\n?", re.MULTILINE)
 
 
@@ -68,6 +69,20 @@ def plain_ply(content: bytes, name: str) -> bytes:
     return _header(elements, lines) + body
 
 
+def texture_name(content: bytes, name: str) -> str | None:
+    """The picture that a comment in the header names; None without one.
+
+    Raises:
+        ValueError: for pictures of several names.
+    """
+    end = _END.search(content)
+    header = text_of(content[: None if end is None else end.start()], name)
+    names = sorted({found.strip() for found in _TEXTURE.findall(header)})
+    if len(names) > 1:
+        raise ValueError(f"{name}: wanted one TextureFile, got {quote(names)}")
+    return names[0] if names else None
+
+
 def _read_header(lines: Iterator[tuple[int, list[str]]], name: str) -> tuple[list[_Element], int]:
     """The elements, and the number of the header's last line."""
     elements: list[_Element] = []
@@ -102,10 +117,8 @@ def _read_header(lines: Iterator[tuple[int, list[str]]], name: str) -> tuple[lis
 
 
 def _header(elements: list[_Element], text: str) -> bytes:
-    """The header of a file of these elements, in the format and with the texture of another."""
-    lines = text.partition("\nend_header")[0].splitlines()
-    written = ["ply", *lines[1:2]]
-    written += [line for line in lines[2:] if re.match(r"(?i)\s*comment\s+texturefile\s", line)]
+    """The header of a file of these elements, in the format of another."""
+    written = ["ply", *text.splitlines()[1:2]]
     for element in elements:
         # By another name trimesh passes edges over.
         name = "lines" if element.name == "edge" else element.name

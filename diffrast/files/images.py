@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float32, UInt8
-from PIL import Image, ImageFile, ImageOps
+from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from diffrast._check import ArrayInput, file_path, flag, float_array, iterable, real_number
 from diffrast.color import linear_to_srgb, srgb_to_linear
@@ -122,12 +122,14 @@ def decoded_picture(
     """
     try:
         with Image.open(io.BytesIO(content)) as image:
-            check_picture(image)
+            _check_picture(image)
             values = _deep_channels(image, content)
             if values is None:
                 values = _channels(ImageOps.exif_transpose(image))
     except Exception as error:  # Pillow's readers fail in any way: SyntaxError, struct.error, ...
-        raise ValueError(f"{name}: cannot be read as an image ({error})") from error
+        unknown = isinstance(error, UnidentifiedImageError)
+        reason = "of no known format" if unknown else error
+        raise ValueError(f"{name}: cannot be read as an image ({reason})") from error
     if srgb:
         values[..., :3] = srgb_to_linear(values[..., :3])
     return values
@@ -136,7 +138,7 @@ def decoded_picture(
 # --------------------------------------------------------------------------------------- details
 
 
-def check_picture(image: Image.Image) -> None:
+def _check_picture(image: Image.Image) -> None:
     """Refuse pictures that are dangerous to decode, before any of their pixels are.
 
     Raises:

@@ -2,10 +2,12 @@
 
 Reading goes through trimesh, an optional dependency (`pip install diffrast[mesh]`), told to
 change nothing: no merging, no reordering, no guessing of normals. `diffrast.files._mesh_text`
-and `._ply` check text formats first, cut polygons into fans, and read OFF.
+and `._ply` check text formats first, cut polygons into fans, and read OFF. Of materials trimesh
+sees only numbers; `diffrast.files._mtl`, `._gltf_materials` and `._ply` read what these are.
 """
 
 import dataclasses
+import functools
 import io
 import logging
 import warnings
@@ -20,17 +22,17 @@ import numpy as np
 from jaxtyping import Float
 
 from diffrast._check import file_path, instance_of
-from diffrast.color import srgb_to_linear
 from diffrast.files import _gltf
 from diffrast.files._folder import Neighbors
+from diffrast.files._look import Look
 from diffrast.files._mesh_text import (
     check_ascii_stl,
     plain_obj,
     read_off,
     text_of,
 )
-from diffrast.files._ply import plain_ply
-from diffrast.files.images import check_picture
+from diffrast.files._mtl import NumberedMaterials, look_of, read_libraries
+from diffrast.files._ply import plain_ply, texture_name
 from diffrast.linalg import normalize
 from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
 
@@ -40,7 +42,8 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 class MeshPart(NamedTuple):
     """The faces of a file that share a material; what the file does not say is `None`.
 
-    `wrap` and `filter` are those of a `Texture`.
+    `name` is that of the material in OBJ files, else of the geometry; `wrap` and `filter` are those
+    of a `Texture`.
     """
 
     name: str
@@ -59,9 +62,11 @@ def load_mesh(path: str | Path) -> Mesh:
 
     Polygons are cut into fans, several geometries are merged in their places. Vertex normals and
     texture coordinates are those of the file, else `None` (`with_normals` makes smooth normals);
-    where only some geometries have them the others get area-weighted normals, or uv (0, 0). An
-    OBJ vertex that occurs with several texture coordinates or normals is split. STL files hold
-    triangles with their own corners and no vertex normals. Points, lines and colours are left out.
+    where only some geometries have them the others get area-weighted normals, or uv (0, 0). Those
+    of an OBJ file are what shares a material: it has normals or uvs where all its corners have
+    them. An OBJ vertex that occurs with several texture coordinates or normals is split. STL files
+    hold triangles with their own corners and no vertex normals. Points, lines, colours and material
+    files are left out.
 
     Args:
         path: the file; its suffix names the format.
@@ -79,8 +84,13 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
     """Read a mesh with its materials, one part for each.
 
     Colours (of an OBJ file's MTL: Ka, Kd, Ks, Ns; of glTF: the base colour) are the file's
-    numbers. Textures are linear RGB or RGBA, row 0 at the top; v of the uvs points up. A material
-    file or picture that is not found in the file's folder, or below, leaves `None`.
+    numbers. Textures (map_Kd, base colour, TextureFile of PLY) are linear RGB or RGBA as
+    `load_image` reads them, row 0 at the top; v of the uvs points up. A material file or picture
+    that is not found in the file's folder, or below, leaves `None`. Nothing else that a material
+    says is read.
+
+    Of the options of map_Kd -clamp says the wrap, -s scales the uvs and -o moves them then; others
+    are an error.
 
     A glTF texture has the wraps of its sampler, and of its filters the nearest one: "nearest" if
     its texels are to be seen from nearby, else "trilinear" if it has smaller images for afar, else
@@ -88,7 +98,8 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
     after its KHR_texture_transform.
 
     Raises:
-        As `load_mesh`; ValueError also for a glTF mesh without the coordinates its texture takes.
+        As `load_mesh`; ValueError also for a material file or a picture that is broken, and for a
+            glTF mesh without the coordinates its texture takes.
     """
     return _read_parts(file_path("path", path), materials=True)
 
@@ -126,20 +137,29 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
     content = path.read_bytes()
     if suffix == ".off":
         return [MeshPart("geometry_0", _off_mesh(content, path))]
+    neighbors = Neighbors(path)
     with _quiet_trimesh() as trimesh:
-        content, options = _checked(content, suffix, path, materials)
+        content, options, looks = _checked(content, suffix, neighbors, materials)
         try:
-            uses = None
             if suffix in (".glb", ".gltf"):
-                content, uses = _gltf.prepare(content, suffix, need_coordinates=materials)
+                content, looks = _gltf.prepare(
+                    content, suffix, neighbors, need_coordinates=materials
+                )
             scene = trimesh.load_scene(
                 io.BytesIO(content),
                 file_type=suffix[1:],
-                resolver=Neighbors(path),
                 process=False,
-                **options,
+                **({"resolver": neighbors} | options),
             )
-            parts = list(_scene_parts(trimesh, scene, uses))
+            parts = list(
+                _scene_parts(
+                    trimesh,
+                    scene,
+                    looks,
+                    is_gltf=suffix in (".glb", ".gltf"),
+                    pictures=materials,
+                )
+            )
         # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
         except Exception as error:
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -152,29 +172,41 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
 
 
 def _checked(
-    content: bytes, suffix: str, path: Path, materials: bool
-) -> tuple[bytes, dict[str, Any]]:
-    """Check text formats; what to give to trimesh, and how."""
-    name = str(path)
+    content: bytes, suffix: str, neighbors: Neighbors, materials: bool
+) -> tuple[bytes, dict[str, Any], list[Look]]:
+    """Check text formats; what to give to trimesh, how, and what `_scene_parts` calls looks."""
+    name = str(neighbors.path)
     if suffix == ".obj":
-        text = plain_obj(text_of(content, name), name, keep_materials=materials)
+        obj = plain_obj(text_of(content, name), name, keep_materials=materials)
         # Keeping the order is right only where there is nothing to split vertices for.
-        plain = "/" not in text.partition("\nf ")[2]
-        return text.encode(), {"maintain_order": plain, "skip_materials": not materials}
+        plain = "/" not in obj.text.partition("\nf ")[2]
+        options = {"maintain_order": plain, "skip_materials": not materials}
+        if not materials:
+            return obj.text.encode(), options, [Look()]
+        looks = read_libraries(obj.libraries, neighbors)
+        numbers = NumberedMaterials(neighbors.path, len(obj.materials))
+        text = f"mtllib numbers\n{obj.text}"
+        return (
+            text.encode(),
+            options | {"resolver": numbers},
+            [*(look_of(material, looks) for material in obj.materials), Look()],
+        )
     if suffix == ".ply":
+        picture = texture_name(content, name) if materials else None
         content = plain_ply(content, name)
         own_uvs = b"texcoord" in content.partition(b"end_header")[0]
-        return content, {"fix_texture": own_uvs, "skip_materials": not materials}
-    elif suffix == ".stl" and len(content) != (wanted := _size_of_binary_stl(content)):
+        read = None if picture is None else functools.partial(neighbors.picture, picture)
+        return content, {"fix_texture": own_uvs}, [Look(picture=read)]
+    if suffix == ".stl" and len(content) != (wanted := _size_of_binary_stl(content)):
         if b"\0" in content:
             raise ValueError(
-                f"{path}: wanted {wanted} bytes, for a header that announces {(wanted - 84) // 50}"
+                f"{name}: wanted {wanted} bytes, for a header that announces {(wanted - 84) // 50}"
                 f" triangles, got {len(content)}"
             )
         text = text_of(content, name)
         check_ascii_stl(text, name)
-        return text.encode(), {}
-    return content, {}
+        return text.encode(), {}, [Look()]
+    return content, {}, [Look()]
 
 
 def _size_of_binary_stl(content: bytes) -> int:
@@ -195,25 +227,45 @@ def _off_mesh(content: bytes, path: Path) -> Mesh:
 
 
 def _scene_parts(
-    trimesh: ModuleType, scene: Any, uses: list[_gltf.TextureUse | None] | None
+    trimesh: ModuleType, scene: Any, looks: list[Look], *, is_gltf: bool, pictures: bool
 ) -> Iterator[MeshPart]:
-    """The parts of a scene; `uses` are those of textures in a glTF file."""
+    """The parts of a scene.
+
+    `looks` are those of materials by number, the last that of what has no material; `pictures`
+    says whether to read their textures.
+    """
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
             continue
-        fields = _material(getattr(geometry.visual, "material", None))
-        uvs = getattr(geometry.visual, "uv", None)
-        if uses is not None:
-            use = _gltf.use_of(geometry, uses)
-            uvs = _gltf.coordinates_of(geometry, use)
-            if use is not None and "texture" in fields:
-                fields |= {"wrap": use.wrap, "filter": use.filter}
-        mesh = _converted(geometry, uvs, is_gltf=uses is not None)
+        material = getattr(getattr(geometry.visual, "material", None), "name", None)
+        named = isinstance(material, str) and material.isdigit()
+        look = looks[int(str(material)) if named else -1]
+        if is_gltf:
+            uvs = _gltf.coordinates_of(geometry, look)
+        else:
+            uvs = getattr(geometry.visual, "uv", None)
+            uvs = None if uvs is None else look.moved(np.array(uvs)[:, :2])
+        mesh = _converted(geometry, uvs, is_gltf=is_gltf)
         if not np.array_equal(matrix, np.eye(4)):
             mesh = transform(mesh, matrix)
-        yield MeshPart(name, mesh, **fields)
+        yield _part(look.name or name, mesh, look, pictures)
+
+
+def _part(name: str, mesh: Mesh, look: Look, pictures: bool) -> MeshPart:
+    texture = look.picture() if pictures and look.picture is not None else None
+    return MeshPart(
+        name=name,
+        mesh=mesh,
+        ambient=look.ambient,
+        diffuse=look.diffuse,
+        specular=look.specular,
+        shininess=look.shininess,
+        texture=texture,
+        wrap=None if texture is None else look.wrap,
+        filter=None if texture is None else look.filter,
+    )
 
 
 def _converted(geometry: Any, uvs: Any, *, is_gltf: bool) -> Mesh:
@@ -231,39 +283,8 @@ def _converted(geometry: Any, uvs: Any, *, is_gltf: bool) -> Mesh:
         vertices=vertices,
         faces=faces,
         normals=None if normals is None else normalize(normals),
-        uvs=None if uvs is None else np.array(uvs)[:, :2],
+        uvs=uvs,
     )
-
-
-def _material(material: Any) -> dict[str, Any]:
-    """Fields of a `MeshPart` from trimesh's material."""
-    numbers = getattr(material, "kwargs", {})
-    fields: dict[str, Any] = {
-        field: np.array(numbers[key], dtype=np.float32)
-        for field, key in (("ambient", "ka"), ("diffuse", "kd"), ("specular", "ks"))
-        if key in numbers and np.shape(numbers[key]) == (3,)
-    }
-    if "ns" in numbers:
-        fields["shininess"] = float(numbers["ns"])
-    base = getattr(material, "baseColorFactor", None)
-    if base is not None:
-        base = np.asarray(base)
-        if base.shape not in ((3,), (4,)):
-            raise ValueError(f"wanted 3 or 4 numbers as a base colour, got shape {base.shape}")
-        scale = 255 if base.dtype == np.uint8 else 1
-        fields["diffuse"] = (base[:3] / scale).astype(np.float32)
-    picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-    if picture is not None:
-        fields["texture"] = _linear_picture(picture)
-    return fields
-
-
-def _linear_picture(picture: Any) -> np.ndarray:
-    check_picture(picture)
-    has_alpha = "A" in picture.getbands() or "transparency" in picture.info
-    values = np.asarray(picture.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
-    color = np.asarray(srgb_to_linear(values[..., :3]))
-    return np.concatenate([color, values[..., 3:]], axis=2)
 
 
 def _merged(meshes: list[Mesh]) -> Mesh:
@@ -317,7 +338,9 @@ def _exported(trimesh: ModuleType, mesh: Mesh, suffix: str) -> bytes:
     visual = None
     mesh = split_uvs(mesh)
     if mesh.uvs is not None:
-        visual = trimesh.visual.TextureVisuals(uv=np.asarray(mesh.uvs))
+        # One that says nothing: trimesh's own is dark, with a picture.
+        material = trimesh.visual.material.PBRMaterial()
+        visual = trimesh.visual.TextureVisuals(uv=np.asarray(mesh.uvs), material=material)
     geometry = trimesh.Trimesh(
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),

@@ -69,8 +69,4 @@ def load_objects(
         mesh = part.mesh if part.mesh.normals is not None else with_normals(part.mesh)
         return Object(mesh, Material(texture=texture, **given))
 
-    parts = load_mesh_parts(path)
-    try:
-        return [object_of(part) for part in parts]
-    except ValueError as error:  # a material of NaN
-        raise ValueError(f"{path}: {error}") from error
+    return [object_of(part) for part in load_mesh_parts(path)]
