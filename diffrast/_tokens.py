@@ -1,9 +1,11 @@
 """Words of a text file, each with its line, for errors that say where."""
 
 import codecs
+import math
 import re
 from pathlib import Path
 
+_WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
 _COMMENT = re.compile(r"\{[^{}]*(\}|\Z)")
 
 
@@ -19,6 +21,19 @@ def decoded(content: bytes) -> str:
 def read_text(path: Path) -> str:
     """Text of a file, as `decoded`, each line ending in a line feed."""
     return re.sub(r"\r\n?", "\n", decoded(path.read_bytes()))
+
+
+def whole(word: str) -> int | None:
+    """An integer as files write it; Python itself would also read 1_000 and ١."""
+    return int(word) if _WHOLE.fullmatch(word) else None
+
+
+def is_finite(word: str) -> bool:
+    """Whether a word is a finite number as files write it."""
+    try:
+        return math.isfinite(float(word)) and word.isascii() and "_" not in word
+    except ValueError:
+        return False
 
 
 class Tokens:
@@ -50,21 +65,15 @@ class Tokens:
     def number(self, wanted: str) -> float:
         """The next word as a finite number."""
         word = self.word(wanted)
-        try:
-            value = float(word)
-        except ValueError:
-            value = float("nan")
-        if not abs(value) < float("inf"):
+        if not is_finite(word):
             raise self.error(wanted)
-        return value
+        return float(word)
 
     def integer(self, wanted: str, minimum: int, bound: int | None = None) -> int:
         """The next word as an integer of at least `minimum` and below `bound`."""
-        word = self.word(wanted)
-        try:
-            value = int(word)
-        except ValueError:
-            raise self.error(wanted) from None
+        value = whole(self.word(wanted))
+        if value is None:
+            raise self.error(wanted)
         if value < minimum or (bound is not None and value >= bound):
             limits = f"of at least {minimum}" if bound is None else f"in [{minimum}, {bound})"
             raise self.error(f"{wanted}, an integer {limits}")

@@ -274,6 +274,8 @@ PATCH = (DATA / "patch.bez").read_text()
         (lambda t: t.replace("3 3 0 0", "4 3 0 0"), 5, "control point number 3, an integer in"),
         (lambda t: t.replace("5 1 2 3", "5 1 two 3"), 7, "y of control point 5, got 'two'"),
         (lambda t: t.replace("5 1 2 3", "5 1 inf 3"), 7, "y of control point 5, got 'inf'"),
+        (lambda t: t.replace("5 1 2 3", "5 1 2_0 3"), 7, "y of control point 5, got '2_0'"),
+        (lambda t: t.replace("14 15 {", "14 1_5 {"), 18, "got '1_5'"),
         (lambda t: t.replace("14 15 {", "14 16 {"), 18, r"an integer in \[0, 16\), got '16'"),
         (lambda t: t.replace("0 0 16 0", "0 1 16 0"), 18, "the surface of patch 0"),
         (lambda t: t.replace("0 0 16 0", "0 0 12 0"), 18, "the number of control points of patch"),

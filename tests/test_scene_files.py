@@ -78,6 +78,8 @@ def test_scenes_are_read_and_written(tmp_path):
         (9, "4 draw", ":9: wanted the operation"),
         (11, "", ":11: wanted the name of the file for the result"),
         (14, "1 nan 2", ":14: wanted the rotation of object 1 of 2, 3 numbers"),
+        (14, "1 1_0 2", ":14: wanted the rotation of object 1 of 2, 3 numbers"),
+        (8, "\u0661", ":8: wanted the number of rows, 1 number"),
     ],
 )
 def test_broken_scenes_name_file_and_line(tmp_path, line, text, message):
@@ -99,6 +101,8 @@ def test_broken_objects_name_file_and_line(tmp_path):
     lines = (DATA / "house.dat").read_text().splitlines()
     for number, text, message in (
         (3, "1 16.0 0.0", "3: wanted z of point 1|4: wanted point number"),
+        (3, "1 16.0 0.0 1_0", "3: wanted z of point 1, got '1_0'"),
+        (3, "\u0661 16.0 0.0 10", "3: wanted point number 1, got '\u0661'"),
         (20, "1 1 5 9 8 7 6 99", "20: wanted a point of polygon 1, an integer in"),
         (19, "0 13 5 0 1 2 3 4", "19: wanted the surface of polygon 0, an integer in"),
     ):

@@ -7,7 +7,6 @@ normals and texture coordinates. Each check here raises `ValueError` "file:line:
 ...".
 """
 
-import math
 import re
 from collections.abc import Iterator
 from itertools import pairwise
@@ -16,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from diffrast._tokens import decoded
+from diffrast._tokens import decoded, is_finite, whole
 
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
-_WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
 _OFF = re.compile(r"(?P<uv>ST)?(?P<color>C)?(?P<normal>N)?(?P<weight>4)?OFF")
 _COMMENT = re.compile(r"(?:^|\s)#(?=\s|$)")  # behind a name, which may have a # itself
 _END_OF_LINE = re.compile(r"\r\n|\r|\n")  # not those that `str.splitlines` finds in letters
@@ -153,7 +151,7 @@ def _obj_corners(words: list[str], counts: dict[str, int], where: str) -> list[l
         for k, (field, count) in enumerate(zip(fields, counts.values(), strict=False)):
             if not field and k > 0:
                 continue
-            index = _whole(field) or 0
+            index = whole(field) or 0
             if index == 0 or index < -count or len(fields) > 3:
                 raise ValueError(
                     f"{where}: wanted a corner v, v/vt, v//vn or v/vt/vn with indices from 1 or"
@@ -308,22 +306,10 @@ def check_indices(words: list[str], bound: int, where: str) -> None:
         )
 
 
-def _whole(word: str) -> int | None:
-    """An integer as these formats write it; Python itself would also read 1_000 and ١."""
-    return int(word) if _WHOLE.fullmatch(word) else None
-
-
 def to_count(word: str) -> int:
     """A number of things, or an index from 0; −1 for any other word."""
-    whole = _whole(word)
-    return -1 if whole is None or whole < 0 else whole
-
-
-def is_finite(word: str) -> bool:
-    try:
-        return math.isfinite(float(word)) and word.isascii() and "_" not in word
-    except ValueError:
-        return False
+    count = whole(word)
+    return -1 if count is None or count < 0 else count
 
 
 def quote(words: list[str]) -> str:

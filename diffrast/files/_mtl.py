@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from diffrast._tokens import is_finite
 from diffrast.files._folder import Neighbors
 from diffrast.files._look import Look, Picture
-from diffrast.files._mesh_text import is_finite, quote, statements, text_of
+from diffrast.files._mesh_text import quote, statements, text_of
 
 _COLORS = {"ka": "ambient", "kd": "diffuse", "ks": "specular"}
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from diffrast._tokens import is_finite
 from diffrast.files._mesh_text import (
     check_indices,
-    is_finite,
     next_line,
     numbered,
     quote,

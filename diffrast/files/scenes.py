@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from diffrast._check import file_path, instance_of
-from diffrast._tokens import Tokens, read_text
+from diffrast._tokens import Tokens, is_finite, read_text
 from diffrast.mesh import Mesh, from_polygons
 
 OPERATIONS = ("wireframe", "normals", "phong", "gouraud")
@@ -268,8 +268,4 @@ class _Lines:
 
 
 def _number(word: str) -> float | None:
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return value if abs(value) < float("inf") else None
+    return float(word) if is_finite(word) else None
