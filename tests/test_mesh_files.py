@@ -372,6 +372,14 @@ def test_gltf_colours_keep_their_digits(tmp_path):
         load_mesh_parts(write(tmp_path / "a.gltf", json.dumps(tree)))
 
 
+def test_obj_faces_before_any_material(tmp_path):
+    write(tmp_path / "m.mtl", "newmtl one\nKd 1 0 0\n")
+    text = f"mtllib m.mtl\n{QUAD}f 1 2 3\nusemtl one\nf 1 3 4\nusemtl two\nf 1 2 4\n"
+    parts = load_mesh_parts(write(tmp_path / "a.obj", text))
+    assert [part.name for part in parts] == ["a.obj", "one", "two"]
+    assert [part.diffuse is None for part in parts] == [True, False, True]
+
+
 def test_objects_of_a_file_carry_its_materials(tmp_path):
     Image.fromarray(np.array([[[255, 0, 0], [0, 188, 0]]], np.uint8)).save(tmp_path / "t.png")
     write(

@@ -43,10 +43,10 @@ def read_libraries(libraries: list[str], neighbors: Neighbors) -> dict[str, Look
     return looks
 
 
-def look_of(name: str | None, looks: dict[str, Look]) -> Look:
+def look_of(name: str | None, looks: dict[str, Look], file_name: str) -> Look:
     """The material that a line `usemtl` names; a # in the name may begin a comment."""
     if name is None:
-        return Look()
+        return Look(name=file_name)
     bare = name.partition("#")[0].strip()
     return looks.get(name, looks.get(bare, Look()))._replace(name=name)
 

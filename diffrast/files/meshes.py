@@ -42,8 +42,8 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 class MeshPart(NamedTuple):
     """The faces of a file that share a material; what the file does not say is `None`.
 
-    `name` is that of the material in OBJ files, else of the geometry; `wrap` and `filter` are those
-    of a `Texture`.
+    `name` is that of the material in OBJ files (of the file for faces of none), else of the
+    geometry; `wrap` and `filter` are those of a `Texture`.
     """
 
     name: str
@@ -137,11 +137,11 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
     content = path.read_bytes()
     if suffix == ".off":
         return [MeshPart("geometry_0", _off_mesh(content, path))]
-    neighbors = Neighbors(path)
+    neighbors, is_gltf = Neighbors(path), suffix in (".glb", ".gltf")
     with _quiet_trimesh() as trimesh:
         content, options, looks = _checked(content, suffix, neighbors, materials)
         try:
-            if suffix in (".glb", ".gltf"):
+            if is_gltf:
                 content, looks = _gltf.prepare(
                     content, suffix, neighbors, need_coordinates=materials
                 )
@@ -151,15 +151,7 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
                 process=False,
                 **({"resolver": neighbors} | options),
             )
-            parts = list(
-                _scene_parts(
-                    trimesh,
-                    scene,
-                    looks,
-                    is_gltf=suffix in (".glb", ".gltf"),
-                    pictures=materials,
-                )
-            )
+            parts = list(_scene_parts(trimesh, scene, looks, is_gltf=is_gltf, pictures=materials))
         # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
         except Exception as error:
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -186,11 +178,8 @@ def _checked(
         looks = read_libraries(obj.libraries, neighbors)
         numbers = NumberedMaterials(neighbors.path, len(obj.materials))
         text = f"mtllib numbers\n{obj.text}"
-        return (
-            text.encode(),
-            options | {"resolver": numbers},
-            [*(look_of(material, looks) for material in obj.materials), Look()],
-        )
+        found = [look_of(material, looks, neighbors.file_name) for material in obj.materials]
+        return text.encode(), options | {"resolver": numbers}, [*found, Look()]
     if suffix == ".ply":
         picture = texture_name(content, name) if materials else None
         content = plain_ply(content, name)
