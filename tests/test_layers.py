@@ -82,6 +82,7 @@ ORDER = [
     "diffrast.files._folder",
     "diffrast.files._look",
     "diffrast.files._mesh_text",
+    "diffrast.files._mesh_writing",
     "diffrast.files._mtl",
     "diffrast.files._ply",
     "diffrast.files._gltf_structure",

@@ -39,11 +39,13 @@ class PlainObj(NamedTuple):
 
     Attributes:
         text: an OBJ file of vertices and triangles, and of `usemtl` with a number.
+        numbers: of each triangle, that which stands before it.
         materials: the names that these numbers stand for; None for faces of no material.
         libraries: what follows `mtllib` on each line.
     """
 
     text: str
+    numbers: list[int]
     materials: list[str | None]
     libraries: list[str]
 
@@ -54,8 +56,7 @@ def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> PlainObj
     Triangles only (polygons as fans), indices from the start of the file, one blank between
     words, the same kind of corner (v, v/vt, v//vn, v/vt/vn) wherever a material is: texture
     coordinates and normals are kept where all its corners have them. Groups, objects, lines and
-    colours are dropped. Without `keep_materials` numbers only part faces with unlike corners, and
-    those stay in their order.
+    colours are dropped. Without `keep_materials` numbers only part faces with unlike corners.
     """
     counts = dict.fromkeys(_OBJ_SIZES, 0)
     vertices: list[str] = []
@@ -75,21 +76,22 @@ def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> PlainObj
             material = words[1] if len(words) > 1 else None
     kinds = _obj_kinds(faces)
     materials: dict[str | None, int] = {}
+    unlike: dict[tuple[bool, bool], int] = {}
     lines: list[str] = []
-    number, last = -1, None
+    numbers: list[int] = []
     for line, material, corners in faces:
         kind = kinds[material]
-        if keep_materials:
-            wanted = materials.setdefault(material, len(materials))
-        else:
-            wanted = number + (kind != last)
-        if wanted != number:
-            lines.append(f"usemtl {wanted}")
-        number, last = wanted, kind
+        number = materials.setdefault(material, len(materials))
+        if not keep_materials:
+            number = unlike.setdefault(kind, len(unlike))
+        if numbers[-1:] != [number]:
+            lines.append(f"usemtl {number}")
         _obj_in_range(line, corners, counts, name)
         written = [_obj_corner(corner, kind) for corner in corners]
         lines += [f"f {written[0]} {b} {c}" for b, c in pairwise(written[1:])]
-    return PlainObj("\n".join([*vertices, *lines, ""]), list(materials), libraries)
+        numbers += [number] * (len(corners) - 2)
+    text = "\n".join([*vertices, *lines, ""])
+    return PlainObj(text, numbers, list(materials), libraries)
 
 
 def statements(text: str, names: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:

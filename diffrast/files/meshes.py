@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from diffrast._check import file_path, instance_of
 from diffrast.files import _gltf
@@ -31,10 +31,11 @@ from diffrast.files._mesh_text import (
     read_off,
     text_of,
 )
+from diffrast.files._mesh_writing import exported, obj_text, off_text
 from diffrast.files._mtl import NumberedMaterials, look_of, read_libraries
 from diffrast.files._ply import plain_ply, texture_name
 from diffrast.linalg import normalize
-from diffrast.mesh import Mesh, merge, split_uvs, transform, with_normals
+from diffrast.mesh import Mesh, merge, transform, with_normals
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
@@ -77,7 +78,9 @@ def load_mesh(path: str | Path) -> Mesh:
             broken file, or a file without faces.
         OSError: when the file cannot be opened.
     """
-    return _merged([part.mesh for part in _read_parts(file_path("path", path), materials=False)])
+    parts, order = _read_parts(file_path("path", path), materials=False)
+    mesh = _merged([part.mesh for part in parts])
+    return mesh if order is None else dataclasses.replace(mesh, faces=mesh.faces[order])
 
 
 def load_mesh_parts(path: str | Path) -> list[MeshPart]:
@@ -101,7 +104,7 @@ def load_mesh_parts(path: str | Path) -> list[MeshPart]:
         As `load_mesh`; ValueError also for a material file or a picture that is broken, and for a
             glTF mesh without the coordinates its texture takes.
     """
-    return _read_parts(file_path("path", path), materials=True)
+    return _read_parts(file_path("path", path), materials=True)[0]
 
 
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -120,37 +123,58 @@ def save_mesh(path: str | Path, mesh: Mesh) -> None:
     instance_of("mesh", mesh, Mesh)
     suffix = _known_suffix(path)
     if suffix == ".obj":
-        path.write_text(_obj_text(mesh), encoding="ascii")
+        path.write_text(obj_text(mesh), encoding="ascii")
     elif suffix == ".off":
-        path.write_text(_off_text(mesh), encoding="ascii")
+        path.write_text(off_text(mesh), encoding="ascii")
     else:
         with _quiet_trimesh() as trimesh:
-            content = _exported(trimesh, mesh, suffix)
+            content = exported(trimesh, mesh, suffix)
         path.write_bytes(content)
 
 
 # --------------------------------------------------------------------------------------- reading
 
 
-def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
+class _Source(NamedTuple):
+    """What to give to trimesh.
+
+    Attributes:
+        content: of a file.
+        options: of trimesh's reader.
+        looks: of materials by number, the last that of what has no material.
+        order: of the file's triangles, their places in all parts together; None for as they come.
+    """
+
+    content: bytes
+    options: dict[str, Any]
+    looks: list[Look]
+    order: Int[np.ndarray, " F"] | None = None
+
+
+def _read_parts(
+    path: Path, *, materials: bool
+) -> tuple[list[MeshPart], Int[np.ndarray, " F"] | None]:
+    """The parts of a mesh, and what `_Source` calls order."""
     suffix = _known_suffix(path)
     content = path.read_bytes()
     if suffix == ".off":
-        return [MeshPart("geometry_0", _off_mesh(content, path))]
+        return [MeshPart("geometry_0", _off_mesh(content, path))], None
     neighbors, is_gltf = Neighbors(path), suffix in (".glb", ".gltf")
     with _quiet_trimesh() as trimesh:
-        content, options, looks = _checked(content, suffix, neighbors, materials)
+        source = _checked(content, suffix, neighbors, materials)
         try:
             if is_gltf:
                 content, looks = _gltf.prepare(
                     content, suffix, neighbors, need_coordinates=materials
                 )
+                source = _Source(content, {}, looks)
             scene = trimesh.load_scene(
-                io.BytesIO(content),
+                io.BytesIO(source.content),
                 file_type=suffix[1:],
                 process=False,
-                **({"resolver": neighbors} | options),
+                **({"resolver": neighbors} | source.options),
             )
+            looks = source.looks
             parts = list(_scene_parts(trimesh, scene, looks, is_gltf=is_gltf, pictures=materials))
         # A reader of foreign data fails in any way: KeyError, struct.error, MemoryError, ...
         except Exception as error:
@@ -160,13 +184,13 @@ def _read_parts(path: Path, *, materials: bool) -> list[MeshPart]:
             ) from error
     if not parts:
         raise ValueError(f"{path}: wanted a mesh with faces, got none")
-    return parts[::-1] if suffix == ".obj" else parts  # trimesh takes materials from the end
+    if suffix == ".obj":
+        parts.reverse()  # trimesh takes materials from the end
+    return parts, source.order
 
 
-def _checked(
-    content: bytes, suffix: str, neighbors: Neighbors, materials: bool
-) -> tuple[bytes, dict[str, Any], list[Look]]:
-    """Check text formats; what to give to trimesh, how, and what `_scene_parts` calls looks."""
+def _checked(content: bytes, suffix: str, neighbors: Neighbors, materials: bool) -> _Source:
+    """Check text formats."""
     name = str(neighbors.path)
     if suffix == ".obj":
         obj = plain_obj(text_of(content, name), name, keep_materials=materials)
@@ -174,18 +198,21 @@ def _checked(
         plain = "/" not in obj.text.partition("\nf ")[2]
         options = {"maintain_order": plain, "skip_materials": not materials}
         if not materials:
-            return obj.text.encode(), options, [Look()]
+            order = None
+            if any(obj.numbers):
+                order = np.argsort(np.argsort(obj.numbers, kind="stable"))
+            return _Source(obj.text.encode(), options, [Look()], order)
         looks = read_libraries(obj.libraries, neighbors)
         numbers = NumberedMaterials(neighbors.path, len(obj.materials))
         text = f"mtllib numbers\n{obj.text}"
         found = [look_of(material, looks, neighbors.file_name) for material in obj.materials]
-        return text.encode(), options | {"resolver": numbers}, [*found, Look()]
+        return _Source(text.encode(), options | {"resolver": numbers}, [*found, Look()])
     if suffix == ".ply":
         picture = texture_name(content, name) if materials else None
         content = plain_ply(content, name)
         own_uvs = b"texcoord" in content.partition(b"end_header")[0]
         read = None if picture is None else functools.partial(neighbors.picture, picture)
-        return content, {"fix_texture": own_uvs}, [Look(picture=read)]
+        return _Source(content, {"fix_texture": own_uvs}, [Look(picture=read)])
     if suffix == ".stl" and len(content) != (wanted := _size_of_binary_stl(content)):
         if b"\0" in content:
             raise ValueError(
@@ -194,8 +221,8 @@ def _checked(
             )
         text = text_of(content, name)
         check_ascii_stl(text, name)
-        return text.encode(), {}, [Look()]
-    return content, {}, [Look()]
+        content = text.encode()
+    return _Source(content, {}, [Look()])
 
 
 def _size_of_binary_stl(content: bytes) -> int:
@@ -218,11 +245,7 @@ def _off_mesh(content: bytes, path: Path) -> Mesh:
 def _scene_parts(
     trimesh: ModuleType, scene: Any, looks: list[Look], *, is_gltf: bool, pictures: bool
 ) -> Iterator[MeshPart]:
-    """The parts of a scene.
-
-    `looks` are those of materials by number, the last that of what has no material; `pictures`
-    says whether to read their textures.
-    """
+    """The parts of a scene; `looks` as in `_Source`, `pictures` says whether to read textures."""
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -289,65 +312,6 @@ def _merged(meshes: list[Mesh]) -> Mesh:
 def _with_zero_uvs(mesh: Mesh) -> Mesh:
     uvs = jnp.zeros_like(mesh.vertices[:, :2])
     return Mesh(vertices=mesh.vertices, faces=mesh.faces, normals=mesh.normals, uvs=uvs)
-
-
-# --------------------------------------------------------------------------------------- writing
-
-
-def _obj_text(mesh: Mesh) -> str:
-    lines = _rows("v ", mesh.vertices)
-    corner = "{0}"
-    if mesh.uvs is not None:
-        lines += _rows("vt ", mesh.uvs)
-        corner = "{0}/{1}"
-    if mesh.normals is not None:
-        lines += _rows("vn ", mesh.normals)
-        corner = "{0}/{1}/{0}" if mesh.uvs is not None else "{0}//{0}"
-    uv_faces = mesh.faces if mesh.uv_faces is None else mesh.uv_faces
-    both = np.stack([np.asarray(mesh.faces), np.asarray(uv_faces)], axis=-1) + 1
-    for face in both.tolist():
-        lines.append("f " + " ".join(corner.format(*indices) for indices in face))
-    return "\n".join([*lines, ""])
-
-
-def _off_text(mesh: Mesh) -> str:
-    faces = [f"3 {a} {b} {c}" for a, b, c in np.asarray(mesh.faces).tolist()]
-    sizes = f"{mesh.vertices.shape[0]} {len(faces)} 0"
-    return "\n".join(["OFF", sizes, *_rows("", mesh.vertices), *faces, ""])
-
-
-def _rows(start: str, values: Any) -> list[str]:
-    """One line for each row, with the digits that its type needs."""
-    array = np.asarray(values)
-    digits = 17 if array.dtype == np.float64 else 9
-    return [start + " ".join(f"{x:.{digits}g}" for x in row) for row in array.tolist()]
-
-
-def _exported(trimesh: ModuleType, mesh: Mesh, suffix: str) -> bytes:
-    visual = None
-    mesh = split_uvs(mesh)
-    if mesh.uvs is not None:
-        # One that says nothing: trimesh's own is dark, with a picture.
-        material = trimesh.visual.material.PBRMaterial()
-        visual = trimesh.visual.TextureVisuals(uv=np.asarray(mesh.uvs), material=material)
-    geometry = trimesh.Trimesh(
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-        vertex_normals=None if mesh.normals is None else np.asarray(mesh.normals),
-        visual=visual,
-        process=False,
-    )
-    has_normals = mesh.normals is not None
-    if suffix == ".ply":
-        return bytes(geometry.export(file_type="ply", vertex_normal=has_normals))
-    if suffix == ".stl":
-        return bytes(geometry.export(file_type="stl"))
-    if suffix == ".glb":
-        return bytes(geometry.export(file_type="glb", include_normals=has_normals))
-    files = geometry.export(
-        file_type="gltf", include_normals=has_normals, merge_buffers=True, embed_buffers=True
-    )
-    return bytes(files["model.gltf"])
 
 
 # --------------------------------------------------------------------------------------- helpers
