@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from diffrast import fit, linalg, shapes
+from diffrast import fit, linalg, shapes, viewing
 from diffrast._tokens import read_text
 from diffrast.camera import Camera, stack_cameras
 from diffrast.color import linear_to_srgb
@@ -53,13 +53,13 @@ _FOR_SCENES = {"command", "run", "default_of", "file", "out", "operation", "no_a
 
 
 class Framing(NamedTuple):
-    """Where a mesh is seen from."""
+    """Where a mesh is seen from; no point of it is farther than `radius` from `centre`."""
 
-    eye: np.ndarray
-    target: np.ndarray
+    eye: np.ndarray | Array
+    target: np.ndarray | Array
     up: np.ndarray
-    near: float
-    far: float
+    centre: np.ndarray
+    radius: float
 
 
 def render_command(options: argparse.Namespace) -> str:
@@ -140,15 +140,11 @@ def fit_command(options: argparse.Namespace) -> str:
         mesh = with_normals(mesh)
 
     def picture_of(params: dict[str, Array], size: RenderSettings) -> Array:
-        camera = Camera.perspective(
+        seen = framing._replace(
             eye=framing.eye + reach * params["eye"],
             target=framing.target + reach * params["target"],
-            up=framing.up,
-            fov_y=math.radians(options.fov),
-            aspect=size.width / size.height,
-            near=framing.near,
-            far=framing.far,
         )
+        camera = _camera(options, seen, size.width / size.height)
         light = DirectionalLight(
             direction=fit.direction_update(light_start, params["light"]),
             ambient=params["ambient"],
@@ -287,7 +283,7 @@ def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
     """The view that was asked for; by default all of the mesh from the front right above."""
     vertices = np.asarray(mesh.vertices, np.float64)
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    reach = float(np.linalg.norm(vertices - centre, axis=1).max())
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     target = centre if options.target is None else np.asarray(options.target, np.float64)
     up = np.asarray(options.up, np.float64)
     if not (np.all(np.isfinite(up)) and np.any(up)):
@@ -298,23 +294,26 @@ def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
         direction = np.roll(np.array([0.75, -1.0, 0.6]), axis - 2) * np.where(
             np.arange(3) == axis, np.sign(up[axis]), 1
         )
-        distance = 1.15 * reach / math.sin(math.radians(options.fov) / 2)
+        distance = 1.15 * radius / math.sin(math.radians(options.fov) / 2)
         eye = target + distance * direction / np.linalg.norm(direction)
     else:
         eye = np.asarray(options.eye, np.float64)
-    distance = float(np.linalg.norm(eye - centre))
-    far = distance + 2 * reach
-    return Framing(eye, target, up, max(distance - 1.5 * reach, far * 1e-3), far)
+    return Framing(eye, target, up, centre, radius)
 
 
-def _camera(options: argparse.Namespace, framing: Framing) -> Camera:
+def _camera(options: argparse.Namespace, framing: Framing, aspect: float = 1.0) -> Camera:
+    """The camera of a framing, which sees the mesh whole in depth from wherever it stands."""
+    backward = viewing.view_axes(framing.target - framing.eye, framing.up)[2]
+    depth = jnp.maximum(linalg.dot(framing.eye - framing.centre, backward), 0)
+    far = lax.stop_gradient(depth + 2 * framing.radius)
     return Camera.perspective(
         eye=framing.eye,
         target=framing.target,
         up=framing.up,
         fov_y=math.radians(options.fov),
-        near=framing.near,
-        far=framing.far,
+        aspect=aspect,
+        near=jnp.maximum(far - 3.5 * framing.radius, far * 1e-3),
+        far=far,
     )
 
 

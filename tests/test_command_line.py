@@ -3,12 +3,13 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import diffrast as dr
 from diffrast import _commands
-from diffrast.__main__ import main
+from diffrast.__main__ import main, parser
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -56,6 +57,25 @@ def test_fit_finds_a_light(tmp_path):
     assert dr.load_image(tmp_path / "fit" / "fit.png").shape == (24, 72, 3)
     assert len(report["eye"]) == len(report["target"]) == len(report["light_direction"]) == 3
     assert report["rms"] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("eye", "target"),
+    [((4, -8, 2), (4, 0, 0)), ((-4, 0, 2), (4, 0, 0)), ((0.3, 0.2, 1.9), (0, 0, 0))],
+)
+def test_a_camera_that_moves_does_not_cut_the_mesh(eye, target):
+    options = parser().parse_args(["orbit", "cube"])
+    cube = dr.shapes.cube()
+    framing = _commands._framing(options, cube)
+
+    @jax.jit
+    def clip(eye, target):
+        camera = _commands._camera(options, framing._replace(eye=eye, target=target))
+        return dr.world_to_clip(camera, cube.vertices)
+
+    _, _, z, w = np.asarray(clip(np.array(eye, float), np.array(target, float))).T
+    assert (w > 0.5).all()
+    assert (abs(z) < w).all()
 
 
 @pytest.mark.parametrize(
