@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from diffrast import fit, linalg, shapes, viewing
-from diffrast._tokens import read_text
+from diffrast._tokens import read_text, without_comments
 from diffrast.camera import Camera, stack_cameras
 from diffrast.color import linear_to_srgb
 from diffrast.files import (
@@ -64,6 +64,7 @@ class Framing(NamedTuple):
 
 def render_command(options: argparse.Namespace) -> str:
     """Draw a mesh, or a scene file."""
+    _check_folder(options.out)
     if is_scene_file(options.file):
         _refuse_for_scenes(options)
         image = render_scene_file(
@@ -73,12 +74,15 @@ def render_command(options: argparse.Namespace) -> str:
     if options.operation is not None:
         raise ValueError(f"{options.file}: --operation is for scene files, which this is none of")
     mesh = load(options.file)
-    camera = _camera(options, _framing(options, mesh))
+    camera = _camera(_framing(options, mesh), math.radians(options.fov))
     return _written(options.out, render(_scene(options, mesh), camera, _settings(options)))
 
 
 def orbit_command(options: argparse.Namespace) -> str:
     """Turn once round a mesh."""
+    _check_folder(options.out)
+    if options.out.suffix.lower() != ".gif":
+        raise ValueError(f"--out: wanted a name that ends in .gif, got {options.out}")
     mesh = load(options.file)
     framing = _framing(options, mesh)
     scene, settings = _scene(options, mesh), _settings(options)
@@ -87,7 +91,7 @@ def orbit_command(options: argparse.Namespace) -> str:
     for k in range(options.frames):
         turn = np.asarray(linalg.rotation(up, 2 * np.pi * k / options.frames))[:3, :3]
         eye = framing.target + turn @ (framing.eye - framing.target)
-        cameras.append(_camera(options, framing._replace(eye=eye)))
+        cameras.append(_camera(framing._replace(eye=eye), math.radians(options.fov)))
     stream = stream_views(image_of, stack_cameras(cameras), (scene, settings))
     images = (image for _, some in stream for image in some)
     frames = list(_with_progress(images, options, options.frames))
@@ -97,6 +101,7 @@ def orbit_command(options: argparse.Namespace) -> str:
 
 def wireframe_command(options: argparse.Namespace) -> str:
     """Draw the edges of a mesh."""
+    _check_folder(options.out)
     if is_scene_file(options.file):
         if options.normals is not None:
             raise ValueError(
@@ -109,10 +114,11 @@ def wireframe_command(options: argparse.Namespace) -> str:
         )
         return _written(options.out, image)
     mesh = load(options.file)
+    thing = Object(mesh, Material(diffuse=options.color))
     size = options.size or 512
     image = wireframe(
-        _scene(options, mesh),
-        _camera(options, _framing(options, mesh)),
+        Scene(objects=[thing], lights=[], background=options.background),
+        _camera(_framing(options, mesh), math.radians(options.fov)),
         height=size,
         width=size,
         hidden=options.hidden,
@@ -127,10 +133,10 @@ def wireframe_command(options: argparse.Namespace) -> str:
 def fit_command(options: argparse.Namespace) -> str:
     """Find eye, target, light and colour from a picture of a known mesh."""
     mesh, picture = load(options.file), load_image(options.image)[..., :3]
-    shrink = max(1, math.ceil(max(picture.shape[:2]) / options.resolution))
-    picture = picture[: picture.shape[0] // shrink * shrink, : picture.shape[1] // shrink * shrink]
-    target = fit.downsample(picture, shrink)
     framing = _framing(options, mesh)
+    target, share = _shrunk(picture, options.resolution)
+    fov_y = 2 * math.atan(share * math.tan(math.radians(options.fov) / 2))
+    options.out.mkdir(parents=True, exist_ok=True)  # before the work, which would be lost
     reach = float(np.linalg.norm(framing.eye - framing.target))
     background, light_start = jnp.asarray(options.background), jnp.asarray(options.light)
     settings = RenderSettings(
@@ -144,7 +150,7 @@ def fit_command(options: argparse.Namespace) -> str:
             eye=framing.eye + reach * params["eye"],
             target=framing.target + reach * params["target"],
         )
-        camera = _camera(options, seen, size.width / size.height)
+        camera = _camera(seen, fov_y, size.width / size.height)
         light = DirectionalLight(
             direction=fit.direction_update(light_start, params["light"]),
             ambient=params["ambient"],
@@ -181,7 +187,6 @@ def fit_command(options: argparse.Namespace) -> str:
     report: dict[str, Any] = {name: np.asarray(v).tolist() for name, v in numbers.items()}
     report["rms"] = math.sqrt(2 * result.loss / target.size)
     report["renders"] = result.renders
-    options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "fit.json").write_text(json.dumps(report, indent=1) + "\n")
     images = [target, picture_of(start, settings), picture_of(found, settings)]
     encoded = [np.asarray(linear_to_srgb(jnp.clip(image, 0, 1))) for image in images]
@@ -192,6 +197,24 @@ def fit_command(options: argparse.Namespace) -> str:
     )
 
 
+def _shrunk(picture: Array, resolution: int) -> tuple[Array, float]:
+    """The picture, no longer than `resolution`, and what share of its rows that shows.
+
+    What fills no whole pixel is left out on both sides, so that the middle stays the middle.
+    """
+    rows, columns = picture.shape[:2]
+    shrink = max(1, math.ceil(max(rows, columns) / resolution))
+    if min(rows, columns) < shrink:
+        raise ValueError(
+            f"--resolution: wanted at least {math.ceil(max(rows, columns) / min(rows, columns))}"
+            f" for a picture of {rows} by {columns} pixels, got {resolution}"
+        )
+    height, width = rows // shrink * shrink, columns // shrink * shrink
+    top, left = (rows - height) // 2, (columns - width) // 2
+    kept = picture[top : top + height, left : left + width]
+    return fit.downsample(kept, shrink), height / rows
+
+
 def gallery_command(options: argparse.Namespace) -> str:
     """Draw every shape of the library, and some L-systems."""
     size = options.size or 192
@@ -200,7 +223,7 @@ def gallery_command(options: argparse.Namespace) -> str:
     for name in _with_progress([*SHAPES, *_systems()], options):
         if name in SHAPES:
             mesh = load(name)
-            camera = _camera(options, _framing(options, mesh))
+            camera = _camera(_framing(options, mesh), math.radians(options.fov))
             settings = RenderSettings(height=size, width=size, samples=4, antialias=False)
             image = render(_scene(options, mesh), camera, settings)
         else:
@@ -240,11 +263,15 @@ def _systems() -> dict[str, tuple[shapes.LSystem, int]]:
 
 
 def is_scene_file(file: str) -> bool:
-    """Whether a file is a scene of the thesis, rather than one of its objects."""
+    """Whether a file is a scene of the thesis, rather than one of its objects.
+
+    Of these the first line that is no comment holds three whole numbers.
+    """
     path = Path(file)
     if path.suffix.lower() != ".dat" or not path.is_file():
         return False
-    first = read_text(path).partition("\n")[0].split()[:3]
+    lines = (line.split() for line in without_comments(read_text(path)).split("\n"))
+    first = next((words for words in lines if words), [])[:3]
     return not (len(first) == 3 and all(word.isdigit() for word in first))
 
 
@@ -271,6 +298,8 @@ def load(file: str) -> Mesh:
         raise FileNotFoundError(
             f"{file}: there is no such file, and no such shape among {', '.join(SHAPES)}"
         )
+    if is_scene_file(file):
+        raise ValueError(f"{file}: wanted a mesh, got a scene file, for render and wireframe")
     if path.suffix.lower() == ".bez":
         return shapes.bezier_mesh(load_bezier(path).control_points)
     if path.suffix.lower() == ".dat":
@@ -282,6 +311,8 @@ def load(file: str) -> Mesh:
 def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
     """The view that was asked for; by default all of the mesh from the front right above."""
     vertices = np.asarray(mesh.vertices, np.float64)
+    if mesh.faces.size:  # what belongs to none of them is not seen
+        vertices = vertices[np.unique(mesh.faces)]
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     target = centre if options.target is None else np.asarray(options.target, np.float64)
@@ -301,7 +332,7 @@ def _framing(options: argparse.Namespace, mesh: Mesh) -> Framing:
     return Framing(eye, target, up, centre, radius)
 
 
-def _camera(options: argparse.Namespace, framing: Framing, aspect: float = 1.0) -> Camera:
+def _camera(framing: Framing, fov_y: float, aspect: float = 1.0) -> Camera:
     """The camera of a framing, which sees the mesh whole in depth from wherever it stands."""
     backward = viewing.view_axes(framing.target - framing.eye, framing.up)[2]
     depth = jnp.maximum(linalg.dot(framing.eye - framing.centre, backward), 0)
@@ -310,7 +341,7 @@ def _camera(options: argparse.Namespace, framing: Framing, aspect: float = 1.0) 
         eye=framing.eye,
         target=framing.target,
         up=framing.up,
-        fov_y=math.radians(options.fov),
+        fov_y=fov_y,
         aspect=aspect,
         near=jnp.maximum(far - 3.5 * framing.radius, far * 1e-3),
         far=far,
@@ -334,6 +365,12 @@ def _settings(options: argparse.Namespace) -> RenderSettings:
         samples=options.samples,
         antialias=not options.no_antialias,
     )
+
+
+def _check_folder(path: Path) -> None:
+    """See that there is a folder for a file, before the work that would be lost."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"--out: wanted a file in a folder that is there, got {path}")
 
 
 def _written(path: Path, image: Array) -> str:

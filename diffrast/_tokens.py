@@ -36,6 +36,11 @@ def is_finite(word: str) -> bool:
         return False
 
 
+def without_comments(text: str) -> str:
+    """Text with blanks instead of {...}; every line stays where it is."""
+    return _COMMENT.sub(lambda comment: re.sub(r"[^\n]", " ", comment[0]), text)
+
+
 class Tokens:
     """Reads white-space separated words one after another; {...} is a comment.
 
@@ -44,8 +49,7 @@ class Tokens:
     """
 
     def __init__(self, text: str, name: str) -> None:
-        visible = _COMMENT.sub(lambda comment: re.sub(r"[^\n]", " ", comment[0]), text)
-        lines = visible.split("\n")
+        lines = without_comments(text).split("\n")
         self._name = name
         self._words = [
             (word, line) for line, content in enumerate(lines, start=1) for word in content.split()

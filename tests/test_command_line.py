@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -44,6 +45,31 @@ def test_wireframes_and_scene_files(tmp_path):
     scene = str(DATA / "scene1.dat")
     assert _commands.is_scene_file(scene)
     assert not _commands.is_scene_file(str(DATA / "house.dat"))
+    house = tmp_path / "house.dat"
+    for head, line in (("{ a house\nwith a roof }\n", "17 13 13\n"), ("", "17 13 13{points}\n")):
+        _, _, rest = (DATA / "house.dat").read_text(encoding="latin-1").partition("\n")
+        house.write_text(head + line + rest)
+        assert not _commands.is_scene_file(str(house))
+
+
+def test_what_belongs_to_no_face_is_not_framed():
+    options = parser().parse_args(["render", "mesh.obj"])
+    cube = dr.shapes.cube()
+    lonely = dr.Mesh(vertices=np.concatenate([cube.vertices, [[999, 0, 0]]]), faces=cube.faces)
+    wanted, got = (_commands._framing(options, mesh) for mesh in (cube, lonely))
+    np.testing.assert_array_equal(got.eye, wanted.eye)
+    assert got.radius == wanted.radius
+
+
+def test_a_picture_that_is_shrunk_keeps_its_middle():
+    picture = np.zeros((50, 71, 3), np.float32)
+    picture[24:26, 35] = 1
+    small, share = _commands._shrunk(jnp.asarray(picture), 20)  # 4 to one, 2 rows, 3 columns off
+    assert small.shape == (12, 17, 3)
+    assert share == 48 / 50
+    small = np.asarray(small[..., 0])
+    np.testing.assert_array_equal(np.argwhere(small), [[5, 8], [6, 8]])
+    assert small[5, 8] == small[6, 8]
 
 
 def test_fit_finds_a_light(tmp_path):
@@ -70,7 +96,7 @@ def test_a_camera_that_moves_does_not_cut_the_mesh(eye, target):
 
     @jax.jit
     def clip(eye, target):
-        camera = _commands._camera(options, framing._replace(eye=eye, target=target))
+        camera = _commands._camera(framing._replace(eye=eye, target=target), 0.7)
         return dr.world_to_clip(camera, cube.vertices)
 
     _, _, z, w = np.asarray(clip(np.array(eye, float), np.array(target, float))).T
@@ -96,6 +122,9 @@ def test_a_camera_that_moves_does_not_cut_the_mesh(eye, target):
         (["wireframe", str(DATA / "scene1.dat"), "--normals", "2"], "use render --operation"),
         (["orbit", "cube", "--up", "0", "0", "0"], "--up: wanted finite numbers that are not all"),
         (["render", "cube", "--samples", "3", "--size", "9"], "samples: wanted a square number"),
+        (["render", "cube", "--out", "nowhere/a.png"], "--out: wanted a file in a folder that is"),
+        (["orbit", "cube", "--out", "orbit.png"], "--out: wanted a name that ends in .gif, got"),
+        (["orbit", str(DATA / "scene1.dat")], "scene1.dat: wanted a mesh, got a scene file"),
     ],
 )
 def test_mistakes_are_told(arguments, message, capsys):
@@ -103,8 +132,22 @@ def test_mistakes_are_told(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_a_fit_tells_before_its_work_what_it_cannot_do(tmp_path, capsys):
+    picture = tmp_path / "thin.png"
+    dr.save_image(picture, np.zeros((2, 300, 3)))
+    assert main(["fit", str(picture), "cube"]) == 2
+    wanted = "--resolution: wanted at least 150 for a picture of 2 by 300 pixels, got 96"
+    assert wanted in capsys.readouterr().err
+    assert main(["fit", str(picture), "cube", "--resolution", "150", "--out", str(picture)]) == 2
+    assert "thin.png" in capsys.readouterr().err
+
+
 def test_options_out_of_range_are_refused(capsys):
     for arguments in (
+        ["orbit", "cube", "--fps", "101"],
+        ["fit", "picture.png", "cube", "--size", "9"],  # of no effect
+        ["wireframe", "cube", "--light", "0", "0", "1"],
+        ["gallery", "--no-antialias"],
         ["render"],
         ["render", "cube", "--fov", "180"],
         ["orbit", "cube", "--frames", "0"],
