@@ -287,10 +287,10 @@ def statistics(outcomes: list[dict[str, Any]], criterion: dict[str, float]) -> d
     }
 
 
-def save_json(path: Path, content: Any) -> None:
-    """Write a result, all or nothing; arrays become lists, floats keep six digits."""
+def save_json(path: Path, content: Any, digits: int = 6) -> None:
+    """Write a result, all or nothing; arrays become lists, floats keep six digits or others."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(_plain(content), indent=1) + "\n"
+    text = json.dumps(_plain(content, digits), indent=1) + "\n"
     save_whole(path, lambda unfinished: unfinished.write_text(text))
 
 
@@ -304,24 +304,26 @@ def save_whole(path: Path, write: Callable[[Path], Any]) -> None:
 def check_same(path: Path, kind: str, wanted: Any, got: Any) -> None:
     """See that what an interrupted run left in a file is of the kind asked for.
 
+    Numbers that `save_json` wrote count as those that they were rounded from.
+
     Raises:
         ValueError: if it is not.
     """
-    if got != wanted:
-        raise ValueError(f"{path}: wanted {kind} of {wanted}, got one of {got}")
+    if got not in (wanted, _plain(wanted)):
+        raise ValueError(f"{path}: wanted {kind} of {_plain(wanted)}, got one of {got}")
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, digits: int = 6) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         names = [field.name for field in dataclasses.fields(value)]
-        return {name: _plain(getattr(value, name)) for name in names}
+        return {name: _plain(getattr(value, name), digits) for name in names}
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(item, digits) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_plain(item, digits) for item in value]
     if isinstance(value, (float, np.ndarray, np.generic, Array)):
         array = np.asarray(value)
         if array.dtype.kind == "f":
-            return _plain([*array]) if array.ndim else float(f"{array:.6g}")
+            return _plain([*array], digits) if array.ndim else float(f"{array:.{digits}g}")
         return array.tolist()
     return value

@@ -33,6 +33,7 @@ import diffrast as dr
 
 FIELD_OF_VIEW = 0.7
 SUN = {"ambient": (0.15, 0.15, 0.15), "specular": (0.4, 0.4, 0.4)}
+DIGITS = 9  # of what is written of cameras: those of float32
 FOLDERS = {"image": "images", "mask": "masks", "normal": "normals", "depth": "depth"}
 
 
@@ -56,8 +57,9 @@ def orbit_cameras(
     centre, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
     away = distance * radius
 
-    def camera(part: Array) -> dr.Camera:
-        around, above = 2 * jnp.pi * part, elevation + rise * part
+    def camera(number: Array) -> dr.Camera:
+        around = 2 * jnp.pi * (number / views)
+        above = elevation + rise * number / max(views - 1, 1)
         way = [jnp.cos(around) * jnp.cos(above), jnp.sin(around) * jnp.cos(above), jnp.sin(above)]
         return dr.Camera.perspective(
             eye=centre + away * jnp.stack(way),
@@ -68,7 +70,7 @@ def orbit_cameras(
             far=away * 2.5,
         )
 
-    return jax.vmap(camera)(jnp.arange(views) / views)
+    return jax.vmap(camera)(jnp.arange(views))
 
 
 def draw(shared: tuple[dr.Scene, dr.RenderSettings], camera: dr.Camera) -> dict[str, Array]:
@@ -114,9 +116,9 @@ def save_cameras(folder: Path, cameras: dr.Camera, views: int, size: int) -> Non
         )
         to_world = np.linalg.inv(np.asarray(camera.view, np.float64))
         frames.append({"file_path": name, "transform_matrix": to_world.tolist()})
-    save_json(folder / "cameras.json", {"width": size, "height": size, "views": opencv})
+    save_json(folder / "cameras.json", {"width": size, "height": size, "views": opencv}, DIGITS)
     lens = {"camera_angle_x": FIELD_OF_VIEW, "w": size, "h": size}
-    save_json(folder / "transforms.json", {**lens, "frames": frames})
+    save_json(folder / "transforms.json", {**lens, "frames": frames}, DIGITS)
 
 
 def contact_sheet(folder: Path, views: int, columns: int = 6) -> np.ndarray:
