@@ -159,6 +159,7 @@ def test_drawings_are_differentiable_in_angles_and_step(make, rounds):
         ({"rules": {"F": "F[F"}}, r"rules\['F'\]: wanted brackets that match"),
         ({"rules": {"+": "F"}}, "rules: wanted symbols of the alphabet"),
         ({"rules": {"F": [(0.5, "F")]}}, r"rules\['F'\]: wanted probabilities that add up"),
+        ({"rules": {"F": [(1, "F"), (np.nan, "F")]}}, r"that add up to 1, got \[1.0, nan\]"),
         ({"rules": {"FG": "F"}}, "rules: wanted single symbols"),
         ({"draw": "G"}, "draw: wanted symbols of the alphabet 'F'"),
         ({"dimensions": 4}, "dimensions: wanted 2 or 3"),

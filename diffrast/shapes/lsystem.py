@@ -261,7 +261,7 @@ def _choices(symbol: str, rule: Rule) -> tuple[tuple[float, str], ...]:
         ) from error
     _check.all_instances(f"rules[{symbol!r}]", [text for _, text in options], str)
     total = sum(chance for chance, _ in options)
-    if not options or min(chance for chance, _ in options) < 0 or abs(total - 1) > 1e-6:
+    if not (options and min(chance for chance, _ in options) >= 0 and abs(total - 1) <= 1e-6):
         raise ValueError(
             f"rules[{symbol!r}]: wanted probabilities that add up to 1, got"
             f" {[chance for chance, _ in options]}"
