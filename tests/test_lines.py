@@ -396,6 +396,31 @@ def test_a_wireframe_leaves_out_what_is_hidden():
     np.testing.assert_allclose(image, image[..., :1] * [1, 0.5, 0.25], atol=1e-6)
 
 
+def test_a_sliver_in_a_crease_hides_none_of_it():
+    corners = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [1, 2, 0], [1, 0, 2], [0.5, 0, 0]])
+    slivers = [[1, 0, 2], [2, 0, 5]]
+    faces = [[0, 1, 3], *slivers, [0, 4, 5], [5, 4, 2], [2, 4, 1]]
+    bent = dr.Mesh(vertices=corners * 0.3 + 0.7, faces=faces)
+    found = {tuple(sorted(edge)) for edge in dl.mesh_edges(bent).tolist()}
+    assert {(0, 5), (2, 5), (1, 2)} <= found
+    assert not {(0, 1), (0, 2)} & found
+    corners[4] = [1, -2, 0]  # in one plane there is no crease
+    level = dl.mesh_edges(dr.Mesh(vertices=corners, faces=faces))
+    found = {tuple(sorted(edge)) for edge in level.tolist()}
+    assert found == {(0, 3), (1, 3), (0, 4), (1, 4)}
+
+
+def test_faces_of_a_mirrored_object_hide_what_they_hid():
+    camera = dr.Camera.perspective(eye=(3, 2.5, 4), target=(0, 0, 0), fov_y=0.8, near=1, far=20)
+
+    def image(transform):
+        scene = dr.Scene(objects=[dr.Object(dr.shapes.cube(), transform=transform)])
+        return dr.wireframe(scene, camera, height=24, width=24, cull_backfaces=True)
+
+    mirrored = np.diag([-1.0, 1, 1, 1])  # the same cube
+    np.testing.assert_allclose(image(mirrored), image(np.eye(4)), atol=1e-5)
+
+
 def test_wireframes_of_known_meshes_are_drawn_inside_of_transformations():
     scene = dr.Scene(objects=[dr.Object(dr.shapes.cube())])
 
@@ -436,6 +461,8 @@ def test_wireframes_of_no_objects_are_checked_too():
     for wrong in (picture[:1], picture[:, :4]):
         with pytest.raises(ValueError, match=r"background: wanted shape \(3,\) or \(4, 6"):
             dr.wireframe(dr.Scene(objects=[], background=wrong), camera, **size)
+    with pytest.raises(ValueError, match="line_width: wanted a number between 0 and inf, got -1"):
+        dr.wireframe(scene, camera, **size, line_width=-1.0)
 
 
 def test_normals_show_in_a_wireframe():

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
-from diffrast._topology import edge_adjacency, join_indices
+from diffrast._topology import EdgeAdjacency, edge_adjacency, join_indices
 from diffrast.camera import Camera, check_single, world_to_clip
-from diffrast.linalg import normalize, transform_normals, transform_points
+from diffrast.linalg import mirrors, normalize, transform_normals, transform_points
 from diffrast.lines.drawing import draw_lines, draw_lines_with_depth
 from diffrast.mesh import Mesh, vertex_normals
 from diffrast.raster import rasterize
@@ -35,7 +35,8 @@ def mesh_edges(mesh: Mesh, *, flat: bool = False) -> Int[np.ndarray, "edges 2"]:
 
     Args:
         mesh: of known vertices and faces. Faces meet where positions are equal.
-        flat: whether to count edges between two faces in one plane, which a polygon has none of.
+        flat: whether to count edges between two faces in one plane, which a polygon has none of. A
+            face without area lies in the plane of the one beyond its longest side.
     """
     _check.instance_of("mesh", mesh, Mesh)
     flat = _check.flag("flat", flat)
@@ -47,14 +48,45 @@ def mesh_edges(mesh: Mesh, *, flat: bool = False) -> Int[np.ndarray, "edges 2"]:
     adjacency = edge_adjacency(positions, faces)
     if flat:
         return adjacency.edges
-    corners = positions[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    with _check.staying_known(across):
-        normals = np.asarray(normalize(across))
+    eps = float(jnp.finfo(mesh.vertices.dtype).eps)
+    normals = _normals_through_slivers(positions, faces, adjacency, eps)
     one, other = (normals[np.maximum(adjacency.edge_faces[:, k], 0)] for k in range(2))
-    bent = np.linalg.norm(np.cross(one, other), axis=1) > _FLAT
-    bent |= (np.sum(one * other, axis=1) < 0) | (adjacency.edge_faces[:, 1] < 0)
-    return adjacency.edges[bent]
+    flat_there = (np.linalg.norm(np.cross(one, other), axis=1) <= _FLAT) & (
+        np.sum(one * other, axis=1) > 0
+    )
+    return adjacency.edges[~flat_there | (adjacency.edge_faces[:, 1] < 0)]
+
+
+def _normals_through_slivers(
+    positions: np.ndarray, faces: np.ndarray, adjacency: EdgeAdjacency, eps: float
+) -> np.ndarray:
+    """Unit normals of faces; one without area has that of the face beyond its longest side.
+
+    Zero where there is none. No area is what rounding of the positions by `eps` may make.
+    """
+    corners = positions[faces]
+    sides = np.roll(corners, -1, axis=1) - corners
+    across = np.cross(sides[:, 0], sides[:, 1])
+    longest = np.linalg.norm(sides, axis=2).max(axis=1)
+    rounding = 4 * eps * np.abs(corners).max(axis=(1, 2)) * longest
+    thin = np.linalg.norm(across, axis=1) <= rounding
+    across[thin] = 0
+    with _check.staying_known(across):
+        normals = np.array(normalize(across))
+    # Of each face the one beyond its longest side: the last one that is written.
+    ends = positions[adjacency.edges]
+    order = np.argsort(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), kind="stable")
+    joined = adjacency.edge_faces[order]
+    joined = np.stack([joined, joined[:, ::-1]], axis=1).reshape(-1, 2)
+    joined = joined[joined[:, 0] >= 0]
+    beyond = np.full(len(faces), -1)
+    beyond[joined[:, 0]] = joined[:, 1]
+    while True:
+        ready = np.flatnonzero(thin & (beyond >= 0) & ~thin[beyond])
+        if not ready.size:
+            return normals
+        normals[ready] = normals[beyond[ready]]
+        thin[ready] = False
 
 
 def polygon_edges(polygons: Sequence[ArrayInput] | np.ndarray) -> Int[np.ndarray, "edges 2"]:
@@ -151,7 +183,7 @@ def wireframe(
                 positions, _check.index_array("edges", own, ("edges", 2), bound=len(positions))
             )
         ]
-        faces.append(item.mesh.faces + first)
+        faces.append((_faces_outward(item) if cull_backfaces else item.mesh.faces) + first)
         if normal_length is not None:
             parts.append(normal_lines(positions, _world_normals(item), normal_length))
         for part in parts:
@@ -165,7 +197,15 @@ def wireframe(
         background = skybox(background, camera, height, width)
     if not points:
         no_points, no_lines = jnp.zeros((0, 2), background.dtype), np.zeros((0, 2), np.int32)
-        return draw_lines(no_points, no_lines, height=height, width=width, background=background)
+        return draw_lines(
+            no_points,
+            no_lines,
+            height=height,
+            width=width,
+            background=background,
+            line_width=line_width,
+            antialias=antialias,
+        )
     positions_clip = world_to_clip(camera, jnp.concatenate(points))
     joined = jnp.concatenate(faces)
     fragments = None
@@ -182,6 +222,11 @@ def wireframe(
         line_width=line_width,
         antialias=antialias,
     )
+
+
+def _faces_outward(item: Object) -> Array:
+    """Faces of an object, turned round where its transform mirrors."""
+    return jnp.where(mirrors(item.transform), item.mesh.faces[:, ::-1], item.mesh.faces)
 
 
 def _world_normals(item: Object) -> Array:
