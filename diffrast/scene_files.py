@@ -1,5 +1,6 @@
 """Pictures of the thesis's scene files (FEATURES G8, L7, T3; Kos 12.2)."""
 
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
@@ -129,7 +130,9 @@ def _assembled(file: SceneFile, meshes: list[tuple[Mesh, np.ndarray]]) -> FileSc
         diffuse=(1 - _AMBIENT,) * 3,
     )
     height = file.raster_height
-    width = max(1, int(height * file.window[0] / file.window[1]))
+    # Of the numbers as they are written: rounding would cost a column.
+    across, up = (Fraction(str(side)) for side in file.window)
+    width = max(1, int(height * across / up))
     scene = Scene(objects=objects, lights=[light])
     edges = tuple(sides for _, sides in meshes)
     return FileScene(scene, _camera(file, objects), edges, height, width, file)

@@ -166,6 +166,18 @@ def test_a_scene_renders_in_all_its_operations(tmp_path):
         dr.render_scene_file(tmp_path / "small.dat", operation="raytrace")
 
 
+@pytest.mark.parametrize(
+    ("window", "rows", "columns"),
+    [((1.1, 1.1), 240, 240), ((0.3, 0.1), 512, 1536), ((0.7, 0.7), 3, 3), ((3, 2), 3, 4)],
+)
+def test_no_column_is_lost_by_rounding(tmp_path, window, rows, columns):
+    scene = dataclasses.replace(load_scene_file(DATA / "scene1.dat"), window=window, objects=())
+    path = tmp_path / "scene.dat"
+    save_scene_file(path, dataclasses.replace(scene, raster_height=rows))
+    file = dr.read_scene(path)
+    assert (file.height, file.width) == (rows, columns)
+
+
 def test_a_scene_is_read_inside_of_jit():
     path = DATA / "scene1.dat"
     camera = jax.jit(lambda: dr.read_scene(path).camera)()
