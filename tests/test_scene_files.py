@@ -68,6 +68,53 @@ def test_scenes_are_read_and_written(tmp_path):
     assert load_scene_file(tmp_path / "turned.dat") == scene
 
 
+def test_what_follows_the_last_object_is_told(tmp_path):
+    lines = (DATA / "scene1.dat").read_text().splitlines()
+    path = tmp_path / "scene.dat"
+    path.write_text("\n".join([*lines, "{that was all}", "", "{really}"]))
+    assert load_scene_file(path) == load_scene_file(DATA / "scene1.dat")
+    path.write_text("\n".join([*lines[:11], "1 {object}", *lines[12:]]))
+    with pytest.raises(ValueError, match=":17: wanted the end of the file after 1 objects, got"):
+        load_scene_file(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"projection": "x"}, "scene.projection: wanted one of parallel, perspective, got 'x'"),
+        ({"operation": "draw"}, "scene.operation: wanted one of"),
+        ({"light": (0, float("nan"), 1)}, "scene.light: wanted a finite number, got nan"),
+        ({"window": (8, -8)}, "scene:7: wanted a window's width and height above 0"),
+        ({"raster_height": 0}, "scene:8: wanted a number of rows of at least 1"),
+        ({"output": ""}, "scene.output: wanted a name without blanks and braces, got ''"),
+        ({"objects": (PlacedFile("my house.dat"),)}, r"scene.objects\[0\].name: wanted a name"),
+        ({"objects": (PlacedFile("a", (1, 1)),)}, r"scene.objects\[0\].scale: wanted 3 numbers"),
+    ],
+)
+def test_scenes_that_could_not_be_read_are_not_written(tmp_path, change, message):
+    scene = dataclasses.replace(load_scene_file(DATA / "scene1.dat"), **change)
+    with pytest.raises(ValueError, match=message):
+        save_scene_file(tmp_path / "scene.dat", scene)
+    assert not (tmp_path / "scene.dat").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": np.full((17, 3), np.nan)}, "polygons:2: wanted x of point 0, got 'nan'"),
+        ({"points": np.zeros((17, 2))}, r"polygons.points: wanted shape \(points, 3\), got"),
+        ({"polygons": ((0, 1, 17),) * 13}, "polygons:19: wanted a point of polygon 0, an integer"),
+        ({"polygons": (), "surfaces": np.zeros(0, int)}, "polygons:1: wanted the number of polyg"),
+        ({"surfaces": np.full(13, -1)}, "polygons:1: wanted the number of surfaces"),
+        ({"surfaces": np.zeros(12, int)}, r"polygons.surfaces: wanted shape \(13,\), got \(12,\)"),
+    ],
+)
+def test_polygons_that_could_not_be_read_are_not_written(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        save_polygons(tmp_path / "a.dat", load_polygons(DATA / "house.dat")._replace(**change))
+    assert not (tmp_path / "a.dat").exists()
+
+
 @pytest.mark.parametrize(
     ("line", "text", "message"),
     [

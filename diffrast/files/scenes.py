@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from diffrast._check import file_path, instance_of
+from diffrast._check import all_instances, file_path, instance_of, one_of, static_number
 from diffrast._tokens import Tokens, is_finite, read_text
 from diffrast.mesh import Mesh, from_polygons
 
@@ -85,7 +85,12 @@ def load_polygons(path: str | Path) -> Polygons:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    tokens = Tokens(read_text(file_path("path", path)), str(path))
+    return _polygons_of(read_text(file_path("path", path)), str(path))
+
+
+def _polygons_of(text: str, name: str) -> Polygons:
+    """The object that a text tells of; errors begin with the name."""
+    tokens = Tokens(text, name)
     count = tokens.integer("the number of points", 1)
     polygon_count = tokens.integer("the number of polygons", 1)
     surface_count = tokens.integer("the number of surfaces", 1, 1 << 31)
@@ -110,19 +115,27 @@ def save_polygons(path: str | Path, polygons: Polygons) -> None:
     """Write an object; reading it gives the same numbers back.
 
     Raises:
-        ValueError: for anything but polygons.
+        ValueError: for anything but polygons, and with the line for what `load_polygons` refuses.
         OSError: when the file cannot be written.
     """
     instance_of("polygons", polygons, Polygons)
-    surfaces = np.asarray(polygons.surfaces)
-    lines = [f"{len(polygons.points)} {len(polygons.polygons)} {surfaces.max() + 1}"]
-    for number, point in enumerate(np.asarray(polygons.points)):
+    points, surfaces = np.asarray(polygons.points), np.asarray(polygons.surfaces)
+    if points.shape[1:] != (3,):
+        raise ValueError(f"polygons.points: wanted shape (points, 3), got {points.shape}")
+    if surfaces.shape != (len(polygons.polygons),):
+        raise ValueError(
+            f"polygons.surfaces: wanted shape ({len(polygons.polygons)},), got {surfaces.shape}"
+        )
+    lines = [f"{len(points)} {len(polygons.polygons)} {max(surfaces.tolist(), default=-1) + 1}"]
+    for number, point in enumerate(points):
         lines.append(
             f"{number} " + " ".join(np.format_float_positional(x, trim="0") for x in point)
         )
     for number, (surface, ids) in enumerate(zip(surfaces, polygons.polygons, strict=True)):
         lines.append(f"{number} {surface} {len(ids)} " + " ".join(map(str, ids)))
-    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    text = "\n".join(lines) + "\n"
+    _polygons_of(text, "polygons")
+    file_path("path", path).write_text(text, encoding="ascii")
 
 
 # --------------------------------------------------------------------------------------- scenes
@@ -133,13 +146,19 @@ def load_scene_file(path: str | Path) -> SceneFile:
 
     One entry a line, in the order of `SceneFile`'s attributes; what follows the numbers on a line
     is a comment. After the number of objects each has its scale, rotation, translation and file
-    name; the thesis's program reads the name first, and such files are read, too.
+    name; the thesis's program reads the name first, and such files are read, too. Nothing but
+    comments in braces follows.
 
     Raises:
         ValueError: with file and line, for anything that does not follow the format.
         OSError: when the file cannot be opened.
     """
-    lines = _Lines(read_text(file_path("path", path)), str(path))
+    return _scene_of(read_text(file_path("path", path)), str(path))
+
+
+def _scene_of(text: str, name: str) -> SceneFile:
+    """The scene that a text tells of; errors begin with the name."""
+    lines = _Lines(text, name)
     projection = PROJECTIONS[lines.choice("the type of projection", len(PROJECTIONS))]
     view_plane_distance = lines.numbers("the view plane's distance (VPD)", 1)[0]
     projection_distance = lines.numbers("the distance of the centre of projection (PRP)", 1)[0]
@@ -164,11 +183,12 @@ def load_scene_file(path: str | Path) -> SceneFile:
     objects = []
     for number in range(count):
         of = f"of object {number + 1} of {count}"
-        name = None if lines.begins_with_number() else lines.word(f"the file name {of}")
+        file = None if lines.begins_with_number() else lines.word(f"the file name {of}")
         placing = [lines.three(f"the {what} {of}") for what in ("scale", "rotation", "translation")]
-        if name is None:
-            name = lines.word(f"the file name {of}")
-        objects.append(PlacedFile(name, *placing))
+        if file is None:
+            file = lines.word(f"the file name {of}")
+        objects.append(PlacedFile(file, *placing))
+    lines.end(f"the end of the file after {count} objects")
     return SceneFile(
         projection=projection,
         view_plane_distance=view_plane_distance,
@@ -186,36 +206,55 @@ def load_scene_file(path: str | Path) -> SceneFile:
 
 
 def save_scene_file(path: str | Path, scene: SceneFile) -> None:
-    """Write a scene; reading it gives the same numbers back.
+    """Write a scene; reading it gives the same one back.
 
     Raises:
-        ValueError: for anything but a scene file.
+        ValueError: for anything but a scene file, for names of several words, and with the line
+            for what `load_scene_file` refuses.
         OSError: when the file cannot be written.
     """
     instance_of("scene", scene, SceneFile)
-
-    def row(*numbers: float, comment: str) -> str:
-        return " ".join(f"{number:.17g}" for number in numbers) + f" {{{comment}}}"
-
+    all_instances("scene.objects", scene.objects, PlacedFile)
+    projection = PROJECTIONS.index(one_of("scene.projection", scene.projection, PROJECTIONS))
+    operation = OPERATIONS.index(one_of("scene.operation", scene.operation, OPERATIONS))
     lines = [
-        row(PROJECTIONS.index(scene.projection), comment="projection: 0 parallel, 1 perspective"),
-        row(scene.view_plane_distance, comment="VPD"),
-        row(scene.projection_distance, comment="PRP, distance from VRP"),
-        row(*scene.view_reference_point, comment="VRP"),
-        row(*scene.view_plane_normal, comment="VPN"),
-        row(*scene.view_up, comment="VUP"),
-        row(*scene.window, comment="window, width and height"),
-        row(scene.raster_height, comment="rows"),
-        row(OPERATIONS.index(scene.operation), comment="operation: " + ", ".join(OPERATIONS)),
-        row(*scene.light, comment="vector to the light"),
-        scene.output,
-        row(len(scene.objects), comment="objects"),
+        f"{projection} {{projection: 0 parallel, 1 perspective}}",
+        _row("view_plane_distance", [scene.view_plane_distance], 1),
+        _row("projection_distance", [scene.projection_distance], 1),
+        _row("view_reference_point", scene.view_reference_point, 3),
+        _row("view_plane_normal", scene.view_plane_normal, 3),
+        _row("view_up", scene.view_up, 3),
+        _row("window", scene.window, 2),
+        _row("raster_height", [scene.raster_height], 1),
+        f"{operation} {{operation: {', '.join(OPERATIONS)}}}",
+        _row("light", scene.light, 3),
+        _one_word("output", scene.output),
+        f"{len(scene.objects)} {{objects}}",
     ]
-    for item in scene.objects:
-        for name in ("scale", "rotation", "translation"):
-            lines.append(row(*getattr(item, name), comment=name))
-        lines.append(item.name)
-    file_path("path", path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for number, item in enumerate(scene.objects):
+        lines += [
+            _row(f"objects[{number}].{name}", getattr(item, name), 3)
+            for name in ("scale", "rotation", "translation")
+        ]
+        lines.append(_one_word(f"objects[{number}].name", item.name))
+    text = "\n".join(lines) + "\n"
+    _scene_of(text, "scene")
+    file_path("path", path).write_text(text, encoding="utf-8")
+
+
+def _row(name: str, numbers: Sequence[float], count: int) -> str:
+    """A line of so many numbers, with what they are."""
+    if np.shape(numbers) != (count,):
+        raise ValueError(f"scene.{name}: wanted {count} numbers, got {numbers!r}")
+    known = [static_number(f"scene.{name}", number) for number in numbers]
+    return " ".join(f"{number:.17g}" for number in known) + f" {{{name}}}"
+
+
+def _one_word(name: str, word: str) -> str:
+    """A line of a name that reading finds the end of."""
+    if not isinstance(word, str) or word.split() != [word] or "{" in word:
+        raise ValueError(f"scene.{name}: wanted a name without blanks and braces, got {word!r}")
+    return word
 
 
 class _Lines:
@@ -254,6 +293,13 @@ class _Lines:
         if not words or words[0].startswith("{"):
             raise self.error(wanted)
         return words[0]
+
+    def end(self, wanted: str) -> None:
+        """Nothing but comments may follow."""
+        while self._next < len(self._lines):
+            line = self._line(wanted)
+            if line and not line[0].startswith("{"):
+                raise self.error(wanted)
 
     def _line(self, wanted: str) -> list[str]:
         if self._next == len(self._lines):
