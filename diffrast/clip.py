@@ -33,7 +33,7 @@ class ClippedPolygons(NamedTuple):
     Attributes:
         corners: clip coordinates.
         barycentrics: of each corner in its triangle, linear in space: attributes mix by them.
-        sizes: number of corners, 0 or at least 3.
+        sizes: number of corners, 0 or at least 3; of a triangle that only touches the planes 0.
     """
 
     corners: Float[Array, "faces corners 4"]
@@ -47,7 +47,7 @@ class ClippedLines(NamedTuple):
     Attributes:
         ends: clip coordinates of both ends.
         positions: of both ends on the line, from 0 at its first point to 1 at its second.
-        seen: whether anything is left.
+        seen: whether anything is left; of a line that only touches the planes nothing is.
     """
 
     ends: Float[Array, "lines 2 4"]
@@ -79,9 +79,9 @@ def clip_triangles(
     count = jnp.full(faces.shape[0], 3, jnp.int32)
     for plane in planes:
         corners, count = _cut(corners, count, plane)
-    exists = jnp.arange(corners.shape[1]) < jnp.where(count >= 3, count, 0)[:, None]
+    exists = jnp.arange(corners.shape[1]) < count[:, None]
     corners = jnp.where(exists[..., None], corners, 0)
-    return ClippedPolygons(corners[..., :4], corners[..., 4:], jnp.where(count >= 3, count, 0))
+    return ClippedPolygons(corners[..., :4], corners[..., 4:], count)
 
 
 def _side(points: Array, plane: Array) -> Array:
@@ -102,7 +102,7 @@ def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     inner = jnp.where(here_in[..., None], corners, after)
     outer = jnp.where(here_in[..., None], after, corners)
     inner_side, outer_side = (jnp.where(here_in, *pair) for pair in _both(here_side, after_side))
-    crosses = used & (here_in != after_in)
+    crosses = used & (here_in != after_in) & (inner_side > 0)  # at 0 the corner is the crossing
     change = jnp.where(crosses, inner_side - outer_side, 1)
     share = jnp.where(crosses, inner_side, 0) / change
     crossing = inner + share[..., None] * (outer - inner)
@@ -115,7 +115,8 @@ def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     result = result.at[face, jnp.where(kept, place, size + 1)].set(corners, mode="drop")
     behind = jnp.where(crosses, place + kept, size + 1)
     result = result.at[face, behind].set(crossing, mode="drop")
-    return result, jnp.sum(amount, axis=1)
+    total = jnp.sum(amount, axis=1)
+    return result, jnp.where(total >= 3, total, 0)  # fewer have no area
 
 
 def _both(first: Array, second: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -151,7 +152,7 @@ def clip_lines(
         low = jnp.where(enters, jnp.maximum(low, crossing), low)
         high = jnp.where(leaves, jnp.minimum(high, crossing), high)
         seen = seen & ((at_first >= 0) | (at_second >= 0))
-    seen = seen & (low <= high)
+    seen = seen & (low < high)
     ends = jnp.stack([first + t[:, None] * (second - first) for t in (low, high)], axis=1)
     ends = ends.at[:, 1].set(jnp.where((high == 1)[:, None], second, ends[:, 1]))
     positions = jnp.where(seen[:, None], jnp.stack([low, high], axis=1), 0)

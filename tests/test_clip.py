@@ -67,6 +67,21 @@ def test_behind_the_eye_and_on_the_planes():
     np.testing.assert_array_equal(same.corners[0, :3], whole)
 
 
+def test_what_only_touches_the_frustum_is_not_seen():
+    points = flat([[1, 0], [2, 1], [2, -1], [1, 0.5], [1, -0.5], [0, 0], [1, 1], [1, 3], [0, 1]])
+    faces = [[0, 2, 1], [3, 4, 1], [5, 0, 8], [5, 2, 0], [6, 7, 1], [0, 1, 7]]
+    cut = clip_triangles(points, faces)
+    np.testing.assert_array_equal(cut.sizes, [0, 0, 3, 3, 0, 0])  # the third whole, half the next
+    for corners in np.asarray(cut.corners)[2:4, :3]:
+        assert len(np.unique(corners, axis=0)) == 3
+    lines = clip_lines(points, [[0, 1], [1, 0], [0, 5], [0, 3], [6, 7], [5, 5]])
+    np.testing.assert_array_equal(lines.seen, [False, False, True, True, False, True])
+    np.testing.assert_array_equal(np.asarray(lines.ends)[~np.asarray(lines.seen)], 0)
+    camera = dr.Camera.orthographic(eye=(0, 0, 5), target=(0, 0, 0), height=2.0, near=1, far=9)
+    with pytest.raises(ValueError, match="mesh: wanted one with a part in the camera's frustum"):
+        clip_mesh(dr.Mesh(vertices=points[:3, :3], faces=[[0, 2, 1]]), camera)
+
+
 def test_neighbours_share_their_new_corners():
     points = flat([[-1.7, -0.31], [1.9, 0.77], [0.3, 3.1], [0.1, -2.9]])
     cut = clip_triangles(points, [[0, 1, 2], [1, 0, 3]])
