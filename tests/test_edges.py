@@ -326,15 +326,23 @@ def area_of_square_on_the_screen():
         ((2, 5), (12, 5), (12, 6), (2, 6)),
         ((2, 2), (10, 2), (14, 10), (6, 10)),
         ((8, 2), (14, 8), (8, 14), (2, 8)),
+        ((3.5, 3.5), (11.5, 3.5), (11.5, 12.5), (3.5, 12.5)),
+        ((3.5005, 3.5), (11.4995, 3.5), (11.5002, 12.5001), (3.4999, 12.4995)),
+        ((3.499, 3.498), (11.501, 3.502), (11.502, 12.499), (3.5, 12.501)),
+        ((8.5, 2.5), (13.5, 7.5), (8.5, 12.5), (3.5, 7.5)),
+        ((2.5, 3.5), (13.5, 3.5), (13.5, 9), (13.5, 13.5)),
+        ((2, 5.5), (12, 5.5), (12, 5.75), (2, 5.75)),
+        ((5.5, 2), (5.8, 2), (5.8, 11), (5.5, 11)),
     ],
 )
-def test_edges_on_borders_between_pixels_belong_to_one_of_these(corners):
-    """Before, such an edge had no derivative."""
+def test_edges_on_borders_and_through_centres_of_pixels_bound_their_exact_area(corners):
+    """Also where a corner is at a centre: which side this is on the rasteriser tells."""
     at, image = np.array(corners, np.float32), area_of_square_on_the_screen()
+    np.testing.assert_allclose(np.sum(image(at)), area_of(at), atol=1e-3)
     got = jax.grad(lambda corners: image(corners).sum())(at)
     steps = 1e-3 * np.eye(8).reshape(8, 4, 2)
     want = [(area_of(at + step) - area_of(at - step)) / 2e-3 for step in steps]
-    np.testing.assert_allclose(np.ravel(got), want, atol=1e-5)
+    np.testing.assert_allclose(np.ravel(got), want, atol=1e-4)
 
 
 def test_needles_that_pierce_a_wall_end_where_they_go_into_it():

@@ -48,8 +48,11 @@ from diffrast.edges.planes import (
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
 from diffrast.edges.unseen import Unseen
 from diffrast.edges.ways import LOOK, Spot, inwards, outwards, sides_of, walked
+from diffrast.raster.fixed_point import subpixel_bits
 
 _SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
+_BY = 1 / 16  # pixels: vertices so near a centre lie where the rasteriser has them
+_TIE = (2.0**-12, 2.0**-17)  # pixels to the right and down: less than the rasteriser's steps
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
 _SMALL = 1e-6  # keeps a ratio of lengths finite
 
@@ -205,7 +208,14 @@ def look(
 
     # Pixels whose centres lie on either side. What the rasteriser shows of an edge that passes
     # through a centre tells on which side that is.
-    to_right = -(middle[0] * normal[0] + middle[1] * normal[1])
+    at_end = [_near(begin) & (low == 0), _near(end) & (high == 1)]
+    snaps = [_snap(vertex, face_image.shape) for vertex in ends]
+    begin, end = (
+        point + jnp.where(is_near, snap, 0)
+        for point, is_near, snap in zip((begin, end), at_end, snaps, strict=True)
+    )
+    by = jnp.where(at_end[0], begin, jnp.where(at_end[1], end, middle))
+    begin, end, to_right = stored_together((begin, end, -_dot(by, normal)))
     depths = stored(depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9]))
     farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + FINE_TOLERANCE) < near))
     farther = (pictured[4] == beyond) | (fold & farther)
@@ -213,8 +223,11 @@ def look(
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
-    snapped = jnp.array(_SNAPPED, near.dtype)
-    shift = stored(jnp.where(close, outward * is_beyond * snapped - to_right, 0))
+    beside = jnp.array(_TIE[1], near.dtype)
+    # Of an edge that ends before the centre the one beyond its corner tells.
+    ends_before = (at_end[0] & (_dot(begin, along) > 0)) | (at_end[1] & (_dot(end, along) < 0))
+    turned = close & ~ends_before & (outward * is_beyond * to_right < beside)
+    shift = stored(jnp.where(turned, outward * is_beyond * beside - to_right, 0))
     centre_depth = -outward * (to_right + shift)
     wrong_side = wrong_side & close
     begin, end, centre_depth = stored_together(
@@ -330,6 +343,25 @@ def _at(image: Int[Array, "height width"], column: Array, row: Array) -> Int[Arr
     """The values of an image at pixels, or at the nearest ones that it has."""
     height, width = image.shape
     return stored(image[row.clip(0, height - 1), column.clip(0, width - 1)].astype(jnp.int32))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return a[0] * b[0] + a[1] * b[1]
+
+
+def _near(point: Array) -> Bool[Array, " n"]:
+    return _dot(point, point) < _BY**2
+
+
+def _snap(vertex: Float[Array, "2 n"], shape: tuple[int, ...]) -> Float[Array, "2 n"]:
+    """From where a vertex near a pixel's centre is to where the rasteriser has it.
+
+    That is on a grid, and a centre on an edge belongs to what is on the right of it, or else below.
+    So all edges that meet at a centre agree on which side that is.
+    """
+    steps = float(1 << subpixel_bits(*shape))
+    tie = jnp.array(_TIE, vertex.dtype)[:, None]
+    return jnp.round(vertex * steps) / steps - vertex - tie
 
 
 def _thickness(apex: Array, start: Array, normal: Array, length: Array, t: Array) -> Array:
