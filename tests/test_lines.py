@@ -234,6 +234,28 @@ def test_drawings_are_differentiable_in_points_and_colors():
         )
 
 
+def test_lines_that_meet_borders_of_pixels_have_all_of_their_derivative():
+    """The sum of all shares is the length of a line of width one."""
+
+    @jax.jit
+    @jax.grad
+    def change(points):
+        return jnp.sum(dr.draw_lines(points, [[0, 1]], height=12, width=12)[..., 0])
+
+    with jax.enable_x64(True):
+        for start, end in (
+            ((1, 1), (9, 9)),
+            ((1, 2), (10, 11)),
+            ((1, 2.5), (10, 2.5)),  # covers pixels of one row, and all of each
+            ((1, 2), (10, 2)),
+            ((2.5, 10), (2.5, 3)),
+            ((1.4, 1.7), (4.4, 5.7)),  # a corner of the rectangle where four pixels meet
+        ):
+            points = np.array([start, end], np.float64)
+            way = np.subtract(*points) / np.linalg.norm(np.subtract(*points))
+            np.testing.assert_allclose(change(points), [way, -way], atol=1e-9)
+
+
 def test_second_derivatives_take_the_first_one_of_the_picture():
     """Where a loss is least they are its square; that of the lines themselves is left out."""
     points, way = jnp.array([[3.0, 4.0], [20.0, 13.5]]), jnp.array([[0.5, -1.0], [0.3, 0.7]])

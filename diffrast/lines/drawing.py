@@ -332,7 +332,8 @@ def _picture(
     sums = add_lines(segments, values, surface, **size, line_width=line_width)
     share = sums[..., -1:]
     mixed = colors * share if colors.ndim == 1 else sums[..., :3]
-    return background * (1 - jnp.minimum(share, 1)) + mixed / jnp.maximum(share, 1)
+    over = share > 1  # a share of one has its derivative
+    return background * (1 - jnp.where(over, 1, share)) + mixed / jnp.where(over, share, 1)
 
 
 def _checked_lines(

@@ -86,19 +86,24 @@ def _area_under(x0: Array, y0: Array, x1: Array, y1: Array) -> Array:
     run, rise = x1 - x0, y1 - y0
     upright = jnp.abs(run) <= jnp.finfo(run.dtype).eps * jnp.abs(rise)
     slope = jnp.where(upright, 0, rise) / jnp.where(upright, 1, run)
-    # From the nearer end, so that an end inside the square is met exactly.
-    low = jnp.where(left == x0, y0, y0 + (left - x0) * slope)
-    high = jnp.where(right == x1, y1, y1 + (right - x1) * slope)
+    # From the nearer end: an end inside the square is met exactly, and one on its border has half
+    # the derivative of either side in both factors.
+    low, high = y0 + (left - x0) * slope, y1 + (right - x1) * slope
     return (right - left) * _mean_clamped(low + 0.5, high + 0.5)
 
 
 def _mean_clamped(a: Array, b: Array) -> Array:
-    """Mean of a linear function from a to b, clamped to 0 to 1."""
+    """Mean of a linear function from a to b, clamped to 0 to 1.
+
+    It is smooth where only one of the two is 0 or 1: there what lies inside has all of the
+    derivative. Where both are, it has a kink, and half of it.
+    """
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
-    inner_low, inner_high = jnp.clip(low, 0, 1), jnp.clip(high, 0, 1)
+    inner_low = jnp.where(low < 0, 0, jnp.where(low < 1, low, 1))
+    inner_high = jnp.where(high <= 0, 0, jnp.where(high <= 1, high, 1))
     middle = (inner_low + inner_high) / 2
     crosses = ((low < 0) & (high > 0)) | ((low < 1) & (high > 1))
     height = jnp.where(crosses, high - low, 1)
-    above = high - jnp.minimum(high, 1)
+    above = jnp.where(high > 1, high - 1, 0)
     partly = ((inner_high - inner_low) * middle + above) / height
     return jnp.where(crosses, partly, middle)
