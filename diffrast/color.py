@@ -144,7 +144,8 @@ def look_up(table: LookUpTable, values: ArrayInput) -> Float[Array, "*size chann
         values: of any shape.
 
     Returns:
-        (..., channels), differentiable in the values and, for a fixed order, in the table.
+        (..., channels), differentiable in the values and, for a fixed order, in the table. At a
+        vertex it has the derivative of the piece that begins there, at the last one of the last.
 
     Raises:
         ValueError: for values that are no numbers, and anything but a table.
@@ -162,7 +163,9 @@ def look_up(table: LookUpTable, values: ArrayInput) -> Float[Array, "*size chann
     width = (positions[1:] - positions[:-1])[piece]
     known = width > 0
     share = (values - positions[piece]) / jnp.where(known, width, 1)
-    share = jnp.where(known, jnp.clip(share, 0, 1), 0)[..., None]
+    # By comparisons: the ends of a piece have its whole derivative, of which `jnp.clip` takes half.
+    inside = known & ~(share < 0)
+    share = jnp.where(inside, jnp.where(share > 1, 1, share), 0)[..., None]
     return (1 - share) * colors[piece] + share * colors[piece + 1]
 
 

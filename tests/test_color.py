@@ -149,6 +149,13 @@ def test_look_up_derivatives():
     assert np.isfinite(step(jnp.array([0.5, 0.5, 0.5]))).all()
 
 
+def test_a_profile_has_the_derivative_of_a_whole_piece_at_its_vertices():
+    table = dr.LookUpTable(positions=[0.0, 0.25, 0.5, 1], colors=[[0.0], [0.25], [0.5], [0]])
+    slopes = jax.vmap(jax.grad(lambda x: dr.look_up(table, x)[0]))
+    values = jnp.array([-0.1, 0, 0.1, 0.25, 0.5, 0.7, 1, 1.1])
+    np.testing.assert_array_equal(slopes(values), [0, 1, 1, 1, -1, -1, -1, 0])
+
+
 def test_recolouring_needs_no_second_picture():
     item = dr.Object(dr.shapes.uv_sphere(segments=12, rings=8))
     light = dr.PointLight(position=(2, 3, 4), attenuation=dr.Attenuation((0, 1, 0), legs="both"))
