@@ -273,6 +273,17 @@ def test_derivatives_of_cubes_and_mappings():
         check_derivatives(colors, *arguments, step=1e-7, rtol=1e-5, atol=1e-5)
 
 
+def test_edges_of_a_cube_have_the_derivative_of_the_side_they_are_looked_up_on():
+    edges = np.array([[1, 1, 1], [1, -1, 0.2], [-1, 0.3, -1], [0.4, -1, 1]])
+    axis = np.argmax(abs(edges), axis=1)[:, None]  # the first of the largest
+    inside = np.where(np.arange(3) == axis, 1, 1 - 1e-7) * edges
+    with jax.enable_x64(True):
+        cube = dr.CubeTexture(np.random.default_rng(1).uniform(size=(6, 4, 4, 1)))
+        slopes = jax.vmap(jax.grad(lambda x: dr.sample_texture(cube, x)[0]))
+        at, beside = np.split(slopes(np.concatenate([edges, inside])), 2)
+        np.testing.assert_allclose(at, beside, atol=1e-5)
+
+
 def test_transformations():
     texture = dr.Texture(IMAGE[:8, :8], filter="trilinear")
     uv = RNG.uniform(size=(3, 5, 2)).astype(np.float32)

@@ -40,8 +40,9 @@ def sample_texture(
     """Filtered colours of a texture.
 
     Differentiable in the texels, in `uv` (but for "nearest") and, through the level of a trilinear
-    texture, in `derivatives`. Coordinates that are not finite, or so large that their fraction is
-    lost, give a finite colour. Memory and time for the smaller levels are spent in each call.
+    texture, in `derivatives`; on an edge of a cube as on one of its sides. Coordinates that are not
+    finite, or so large that their fraction is lost, give a finite colour. Memory and time for the
+    smaller levels are spent in each call.
 
     Args:
         texture: its own mapping is not used.
@@ -249,7 +250,8 @@ def _folded(coordinate: Array, wrap: str) -> tuple[Array, Array]:
     known = jnp.abs(coordinate) < 2.0 ** (2 * bits)
     coordinate = jnp.where(known, coordinate, 0)
     if wrap not in ("repeat", "mirror"):
-        coordinate = jnp.clip(coordinate, 0, 1)
+        # By comparisons: at 0 and 1, the edges of a cube, `jnp.clip` takes half of the derivative.
+        coordinate = jnp.where(coordinate > 1, 1, jnp.where(coordinate < 0, 0, coordinate))
     place = lax.stop_gradient(coordinate)
     high = jnp.round(place * 2.0**bits) / 2.0**bits
     low = coordinate - high
