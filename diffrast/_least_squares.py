@@ -143,7 +143,10 @@ def _normal_equations(
     flat = flat + step.astype(flat.dtype)
 
     def flat_residuals(x: Array) -> Array:
-        r = ravel_pytree(residuals(unravel(x), *args))[0]
+        result = residuals(unravel(x), *args)
+        if not jax.tree.leaves(result):
+            raise ValueError(f"residuals: wanted a function to arrays, got {result!r} from it")
+        r = ravel_pytree(result)[0]
         if not jnp.issubdtype(r.dtype, jnp.floating):
             raise ValueError(f"residuals: wanted floating-point numbers, got dtype {r.dtype}")
         return r

@@ -88,8 +88,8 @@ def minimize(
         The best parameters met. A loss or gradient that becomes NaN or infinite ends the fit.
 
     Raises:
-        ValueError: for parameters that are not real and finite, and for a loss that is not
-            a scalar or has no finite value or gradient at the start.
+        ValueError: for parameters that are not real and finite, or without any number, and for a
+            loss that is not a scalar or has no finite value or gradient at the start.
     """
     _check_function("loss", loss)
     params = _float_tree(params)
@@ -162,7 +162,10 @@ def _gradient_step(
     """
 
     def value_of(params: Params) -> Array:
-        value = jnp.asarray(loss(params, *args))
+        result = loss(params, *args)
+        if result is None:
+            raise ValueError("loss: wanted a function to a scalar, got one that returns nothing")
+        value = jnp.asarray(result)
         if value.shape != ():
             raise ValueError(f"loss: wanted a function to a scalar, got shape {value.shape}")
         return value
@@ -222,8 +225,9 @@ def least_squares(
         influence stay as they are.
 
     Raises:
-        ValueError: for parameters that are not real and finite, for residuals of whole or complex
-            numbers, and for residuals or a Jacobian that are not finite at the start.
+        ValueError: for parameters that are not real and finite, or without any number, for
+            residuals that are no array or of whole or complex numbers, and for residuals or a
+            Jacobian that are not finite at the start.
 
     Example:
         >>> times, places = jnp.arange(4.0), jnp.array([1.0, 3, 5, 7])
@@ -311,9 +315,12 @@ def _float_tree(params: Params) -> Params:
         array = float_array(f"params{jax.tree_util.keystr(path)}", leaf)
         return jnp.asarray(array, array.dtype)  # not weakly typed: the next step will not be
 
-    if not jax.tree.leaves(params):
-        raise ValueError(f"params: wanted a pytree with at least one array, got {params!r}")
-    return jax.tree_util.tree_map_with_path(checked, params)
+    arrays = jax.tree_util.tree_map_with_path(checked, params)
+    if not any(array.size for array in jax.tree.leaves(arrays)):
+        raise ValueError(
+            f"params: wanted a pytree with at least one array of numbers, got {params!r}"
+        )
+    return arrays
 
 
 def direction_update(direction: ArrayLike, tangent: ArrayLike) -> Float[Array, "3"]:

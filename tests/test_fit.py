@@ -328,6 +328,7 @@ def test_bad_input(run):
         ({"a": np.nan}, r"params\['a'\]: wanted finite numbers"),
         ({"a": True}, r"params\['a'\]: wanted real numbers"),
         ({}, "params: wanted a pytree with at least one array"),
+        ({"a": np.zeros((0, 3))}, "params: wanted a pytree with at least one array of numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             run(identity, bad)
@@ -344,6 +345,10 @@ def test_more_bad_input():
         fit.minimize(lambda x: jnp.stack([x, x]), 1.0)
     with pytest.raises(ValueError, match="residuals: wanted floating-point numbers, got dtype int"):
         fit.least_squares(lambda p: jnp.round(p).astype(int), jnp.ones(2))
+    with pytest.raises(ValueError, match="loss: wanted a function to a scalar, got one that ret"):
+        fit.minimize(lambda x: None, 1.0)
+    with pytest.raises(ValueError, match="residuals: wanted a function to arrays, got None from"):
+        fit.least_squares(lambda p: None, jnp.ones(2))
     with pytest.raises(ValueError, match="method: wanted one of"):
         fit.least_squares(jnp.asarray, 1.0, method="newton")
     with pytest.raises(ValueError, match="loss: wanted one of squared, huber"):
