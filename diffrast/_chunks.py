@@ -58,11 +58,13 @@ def _room(function: ViewFunction, structure: Any, kinds: Kinds) -> int:
 def kept(result: Any) -> Any:
     """Stores what a function returns, which would else be computed where it is put into place.
 
-    That is one loop on one core, in which nothing is computed once for several values.
+    That is one loop on one core, in which nothing is computed once for several values. Numbers in
+    the function's code become arrays, as those that `jax.jit` returns.
     """
 
     def keep(x: Any) -> Any:
-        return stored(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x
+        x = jnp.asarray(x)
+        return stored(x) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
     return jax.tree.map(keep, result)
 

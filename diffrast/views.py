@@ -72,8 +72,8 @@ def render_views(
         (views, height, width, 3) linear RGB.
 
     Raises:
-        ValueError: for cameras that are no stack or of unequal sizes, a chunk below 1 and an empty
-            list of devices.
+        ValueError: for cameras that are no stack or of unequal sizes, a chunk below 1, an empty
+            list of devices and one in which a device comes twice.
     """
     instance_of("scene", scene, Scene)
     instance_of("cameras", cameras, Camera)
@@ -103,8 +103,8 @@ def map_views(
     """Apply a function to every view and stack what it returns.
 
     Args:
-        function: `function(shared, view)` of arrays, as `jax.jit` takes it; pass the same object
-            again and it is compiled once.
+        function: `function(shared, view)` of arrays, as `jax.jit` takes it, to a tree of arrays
+            and numbers; pass the same object again and it is compiled once.
         views: a tree of arrays with a common leading axis.
         shared: a tree of arrays that all views have in common.
         chunk: as in `render_views`.
@@ -196,9 +196,10 @@ def sum_views(
 
         return lax.scan(add, nothing, views)[0]
     total = None
-    each = _BLOCK * max(len(devices), 1)
+    loops = max(len(devices), 1)  # each gives a row
+    each = _BLOCK * loops
     for _, part in in_order(block_sum, function, views, shared, _BLOCK, each, devices):
-        for row in range(jax.tree.leaves(part)[0].shape[0]):
+        for row in range(loops):
             block = jax.tree.map(lambda x, row=row: x[row], part)
             total = block if total is None else jax.tree.map(operator.add, total, block)
     return jax.tree.map(jnp.asarray, total)
@@ -227,6 +228,8 @@ def _checked(
         all_instances("devices", devices, jax.Device)
         if len(devices) == 0:
             raise ValueError("devices: wanted at least one, got none")
+        if len(set(devices)) < len(devices):
+            raise ValueError(f"devices: wanted each one once, got {list(devices)}")
     return shapes[0][0], chunk, tuple(devices or ())
 
 

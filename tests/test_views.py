@@ -197,6 +197,10 @@ def test_the_number_of_processes_changes_no_bit():
             "devices: wanted at least one, got none",
         ),
         (
+            lambda: views.map_views(wave, TURNS, 1.0, devices=jax.devices()[:1] * 2),
+            "devices: wanted each one once, got",
+        ),
+        (
             lambda: views.map_views(lit_from, (TURNS, TURNS[:3])),
             "views: wanted arrays with a common leading axis",
         ),
@@ -231,6 +235,19 @@ def test_random_keys_and_known_numbers_inside_of_jit():
     np.testing.assert_allclose(outside, TURNS * jax.random.uniform(KEYS[0]), rtol=1e-6)
     inside = jax.jit(lambda: views.map_views(lambda scale, turn: scale * turn, TURNS, 2.0))()
     np.testing.assert_array_equal(inside, 2 * TURNS)
+
+
+def test_functions_may_return_numbers_and_nothing():
+    def some(_, turn):
+        return turn, 2.5, 3, None
+
+    rows, halves, counts, nothing = views.map_views(some, TURNS)
+    np.testing.assert_array_equal(rows, TURNS)
+    assert (halves.tolist(), counts.tolist(), nothing) == ([2.5] * 5, [3] * 5, None)
+    total, *rest = views.sum_views(some, TURNS)
+    np.testing.assert_allclose(total, np.sum(TURNS), rtol=1e-6)
+    assert rest == [12.5, 15, None]
+    assert views.sum_views(lambda _, turn: None, TURNS) is None
 
 
 def test_no_views_give_no_images():
