@@ -243,7 +243,8 @@ class Camera:
         Differentiable in every array. The module's docstring tells where the pixels' centres are.
 
         Args:
-            intrinsics: K (3, 3) in pixels, last row (0, 0, 1); skew is allowed.
+            intrinsics: K (3, 3) in pixels, last row (0, 0, 1); skew is allowed, focal lengths of
+                zero are not.
             rotation: R (3, 3), from the world to x right, y down, z forward.
             translation: t (3,), the world's origin in those coordinates.
             width: of the image that K is meant for, in pixels.
@@ -251,6 +252,11 @@ class Camera:
             near: depth of the nearest points shown, above zero.
             far: depth of the farthest points shown.
             distortion: k1, k2, p1, p2, k3, or None for none.
+
+        Raises:
+            ValueError: for wrong shapes, numbers that are not finite, sizes and depths out of
+                range, a matrix that is known not to be such a K, and one that is known to be no
+                rotation.
         """
         view = opencv.view_from_opencv(rotation, translation)
         projection = opencv.projection_from_opencv(

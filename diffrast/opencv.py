@@ -44,10 +44,14 @@ def projection_from_opencv(
 ) -> Float[Array, "4 4"]:
     """Projection of a camera with this intrinsic matrix; see `Camera.opencv`."""
     intrinsics = float_array("intrinsics", intrinsics, (3, 3))
-    if is_concrete(intrinsics) and np.any(np.asarray(intrinsics)[2] != (0, 0, 1)):
-        raise ValueError(
-            f"intrinsics: wanted a last row (0, 0, 1), got {np.asarray(intrinsics)[2].tolist()}"
-        )
+    if is_concrete(intrinsics):
+        (a, b, _), (c, d, _), last = known = np.asarray(intrinsics, np.float64)
+        if np.any(last != (0, 0, 1)):
+            raise ValueError(f"intrinsics: wanted a last row (0, 0, 1), got {last.tolist()}")
+        if a * d == b * c:
+            raise ValueError(
+                f"intrinsics: wanted focal lengths other than zero, got {known.tolist()}"
+            )
     x = 2 * intrinsics[0] / positive_int("width", width)
     y = 2 * intrinsics[1] / positive_int("height", height)
     zero = jnp.zeros_like(x[0])

@@ -558,6 +558,10 @@ def test_precision_follows_the_input():
         (lambda: phigs(back=4.0), "back: wanted"),
         (lambda: opencv_camera(rotation=-np.eye(3)), "rotation: wanted a rotation matrix"),
         (lambda: opencv_camera(intrinsics=np.ones((3, 3))), "intrinsics: wanted a last row"),
+        (
+            lambda: opencv_camera(intrinsics=INTRINSICS * [[0.0], [1.0], [1.0]]),
+            "intrinsics: wanted focal lengths other than zero, got",
+        ),
         (lambda: opencv_camera(width=0), "width: wanted an integer of at least 1"),
         (lambda: to_opencv(orthographic(), height=4, width=4), "wanted a perspective camera"),
         (lambda: stack_cameras([]), "cameras: wanted at least one"),
