@@ -223,11 +223,11 @@ def look(
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
-    beside = jnp.array(_TIE[1], near.dtype)
+    least = jnp.array(_TIE[1], near.dtype)
     # Of an edge that ends before the centre the one beyond its corner tells.
     ends_before = (at_end[0] & (_dot(begin, along) > 0)) | (at_end[1] & (_dot(end, along) < 0))
-    turned = close & ~ends_before & (outward * is_beyond * to_right < beside)
-    shift = stored(jnp.where(turned, outward * is_beyond * beside - to_right, 0))
+    turned = close & ~ends_before & (outward * is_beyond * to_right < least)
+    shift = stored(jnp.where(turned, outward * is_beyond * least - to_right, 0))
     centre_depth = -outward * (to_right + shift)
     wrong_side = wrong_side & close
     begin, end, centre_depth = stored_together(
