@@ -12,9 +12,9 @@ from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._topology import EdgeAdjacency, edge_adjacency, join_indices
 from diffrast.camera import Camera, check_single, world_to_clip
-from diffrast.linalg import mirrors, normalize, transform_normals, transform_points
+from diffrast.linalg import normalize, transform_normals, transform_points
 from diffrast.lines.drawing import draw_lines, draw_lines_with_depth
-from diffrast.mesh import Mesh, vertex_normals
+from diffrast.mesh import Mesh, transform, vertex_normals
 from diffrast.raster import rasterize
 from diffrast.scene import Object, Scene
 from diffrast.texture import CubeTexture
@@ -183,7 +183,8 @@ def wireframe(
                 positions, _check.index_array("edges", own, ("edges", 2), bound=len(positions))
             )
         ]
-        faces.append((_faces_outward(item) if cull_backfaces else item.mesh.faces) + first)
+        outward = transform(item.mesh, item.transform).faces if cull_backfaces else item.mesh.faces
+        faces.append(outward + first)
         if normal_length is not None:
             parts.append(normal_lines(positions, _world_normals(item), normal_length))
         for part in parts:
@@ -222,11 +223,6 @@ def wireframe(
         line_width=line_width,
         antialias=antialias,
     )
-
-
-def _faces_outward(item: Object) -> Array:
-    """Faces of an object, turned round where its transform mirrors."""
-    return jnp.where(mirrors(item.transform), item.mesh.faces[:, ::-1], item.mesh.faces)
 
 
 def _world_normals(item: Object) -> Array:
