@@ -61,6 +61,7 @@ ORDER = [
     "diffrast.edges.visibility",
     "diffrast.edges.areas",
     "diffrast.edges.piercing",
+    "diffrast.edges.shadow_planes",
     "diffrast.edges.shadow_lines",
     "diffrast.edges.records",
     "diffrast.edges.blend",

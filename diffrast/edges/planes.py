@@ -5,6 +5,7 @@ and relative to the point, so that small faces far from the image's origin lose 
 """
 
 from functools import reduce
+from operator import add
 
 import jax.numpy as jnp
 from jax import Array
@@ -26,6 +27,11 @@ def cross_rows(a: Array, b: Array) -> Array:
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
+
+
+def dot_rows(a: Array, b: Array) -> Array:
+    """Dot products, row by row: a reduction of so few would be a call into a library."""
+    return reduce(add, [x * y for x, y in zip(a, b, strict=True)])
 
 
 def largest(vectors: Array) -> Array:

@@ -5,18 +5,13 @@ falls on that face: along a straight line on the screen. It is drawn on each fac
 the pixels round one, and cut to that pixel, to the face and, at a corner of the outline, where the
 next line begins; then it parts areas as an edge of a mesh does.
 
-With h the weight of points, 1 for places and 0 for directions, (x, y, w, h) are coordinates of
-space for a perspective camera, which drops h. For a parallel projection h is the weight that tells
-depth (see `Depth`), and moves with the light. The plane of a face is (r, r'), r · (x, y, w) + r' h
-= 0, and that of the shadow (p, p'); they meet on the screen where (r' p − p' r) · (x, y, 1) = 0.
-Where the corners of the shadow plane move, what it says of a point M = α light + β start + γ end
-changes by −p · (α dlight + β dstart + γ dend) − p' α dh of the light; and where those of the face
-do, the point seen at a place of the screen moves along the line of sight.
+With the face's plane (r, r') and the shadow's (p, p'), see `shadow_planes`: where the corners of
+the shadow plane move, what it says of a point M = α light + β start + γ end changes by −p ·
+(α dlight + β dstart + γ dend) − p' α dh of the light; and where those of the face do,
+the point seen at a place of the screen moves along the line of sight.
 """
 
 import itertools
-from functools import reduce
-from operator import add
 from typing import NamedTuple
 
 import jax
@@ -32,10 +27,20 @@ from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
     barycentrics,
-    cross_rows,
+    dot_rows,
     edge_functions,
     edge_values,
     largest,
+)
+from diffrast.edges.shadow_planes import (
+    Plane,
+    edge_plane,
+    end_plane,
+    face_plane,
+    line_of,
+    meeting,
+    nonzero,
+    shadow_plane,
 )
 
 PIXELS_AT_ONCE = 512
@@ -46,7 +51,6 @@ _CERTAIN = 8  # times as much as another one tells the middle one where outlines
 _EDGES = 4  # whose shadows part a pixel, at most,
 _FACES = 4  # on so many faces
 _REACH = 0.75  # pixels from the centre: farther than the corners
-_ROUNDINGS = 64  # in a line's coefficients
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
@@ -73,11 +77,6 @@ class Cast(NamedTuple):
     source: Float[Array, "lights 4"]  # clip position
     weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
     parallel: Bool[Array, ""]  # whether the weight moves with the light
-
-
-class _Plane(NamedTuple):
-    normal: Float[Array, "3 *n"]  # of x, y and w
-    offset: Float[Array, "*n"]  # of h
 
 
 class Places(NamedTuple):
@@ -207,22 +206,22 @@ def cross_shadows(
     weight = cast.weight[light]
 
     # Of each edge (rows) on each face (columns).
-    ground, shadow = _face_plane(corners), _shadow_plane(source[:, None], weight, *ends)
+    ground, shadow = face_plane(corners), shadow_plane(source[:, None], weight, *ends)
     tip = place(faces[caster, third])
-    above = _dot(shadow.normal, tip) + shadow.offset
-    ends_of = [_end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
-    ground = _Plane(ground.normal[:, None], ground.offset[None])
-    shadow, *ends_of = (_Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, *ends_of))
-    normal, foot, inverse = stored(_line(ground, shadow))
+    above = dot_rows(shadow.normal, tip) + shadow.offset
+    ends_of = [end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
+    ground = Plane(ground.normal[:, None], ground.offset[None])
+    shadow, *ends_of = (Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, *ends_of))
+    normal, foot, inverse = stored(line_of(ground, shadow))
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
     tells = jnp.abs(above) > _EDGE_ON * largest(tip - ends[0])
     to_lit = (steps_to(lit_look) - steps_to(dark_look))[:, :, None]
-    lit_on_right = jnp.where(tells[:, None], above[:, None] <= 0, _dot(normal, to_lit) > 0)
+    lit_on_right = jnp.where(tells[:, None], above[:, None] <= 0, dot_rows(normal, to_lit) > 0)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
-    beyond = _dot(outwards, foot)  # less than this along `outwards` it is dark
+    beyond = dot_rows(outwards, foot)  # less than this along `outwards` it is dark
     # Of an edge that hides something else the line passes elsewhere.
-    outer, inner = (_dot(outwards, steps_to(look)[:, :, None]) - beyond for look in looks)
+    outer, inner = (dot_rows(outwards, steps_to(look)[:, :, None]) - beyond for look in looks)
     passes = (inverse > 0) & (inner < _BESIDE) & (outer > -_BESIDE)
     of_pair = jnp.broadcast_to(is_own, passes.shape)
     for look in looks:
@@ -238,11 +237,13 @@ def cross_shadows(
     for _ in range(2):
         chain = chain | jnp.any(linked & chain, axis=1)
     along_first = jnp.sum(jnp.where(primary, outwards[:, :, 0], 0), axis=1)
-    chosen = chain | (valid & (_dot(outwards[:, :, 0], along_first[:, None]) < _OPPOSITE))
+    chosen = chain | (valid & (dot_rows(outwards[:, :, 0], along_first[:, None]) < _OPPOSITE))
 
     # Outlines that are not linked end at each other: those of several shadows where all of them let
     # the light pass, at the corner of one shadow where the other one does not.
-    told = _dot(outwards[:, None, :, 0], steps_to(jnp.arange(9))[..., None, None]) > beyond[:, 0]
+    told = (
+        dot_rows(outwards[:, None, :, 0], steps_to(jnp.arange(9))[..., None, None]) > beyond[:, 0]
+    )
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
     certain = jnp.where((jnp.arange(9)[:, None] == 4) & is_own[0], _CERTAIN, 1)
@@ -253,7 +254,7 @@ def cross_shadows(
     side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
-    limits = [_meet(ground, plane) for plane in ends_of]
+    limits = [meeting(ground, plane) for plane in ends_of]
     cut = [jnp.any(meet & chosen, axis=1)[:, None] for meet in meets]
 
     def inside(at: Array) -> list[Array]:
@@ -336,7 +337,7 @@ def _continued(
     low, high = own
     here = usable & (low < high)
     axis = along[:, :, :1]
-    step, at = _dot(along, axis), _dot(foot, axis)
+    step, at = dot_rows(along, axis), dot_rows(foot, axis)
     begin, end = (at + (2 * part - 1) * step for part in own)
     middle = jnp.where(here, begin + end, jnp.inf)
     order = jnp.arange(_FACES)[:, None, None]
@@ -346,7 +347,7 @@ def _continued(
     )
     following = jnp.min(jnp.where(later, begin[:, None], jnp.inf), axis=2)
     first = here & (jnp.sum(later, axis=2) == jnp.sum(here, axis=1, keepdims=True) - 1)
-    alike = step > 0.5 * _dot(axis, axis)  # in direction
+    alike = step > 0.5 * dot_rows(axis, axis)  # in direction
     up_to = ((following - at) / jnp.where(alike, step, 1) + 1) / 2
     longer = jnp.maximum(high, jnp.minimum(room[1], up_to))
     # Where it is on none, but all of these are one plane, or nearly: in the first.
@@ -388,13 +389,13 @@ def shadow_of(
     )
     centre_is_lit, alone = outlines.centre_is_lit[place], outlines.alone[place]
     start, end = stored_together((of_edge(outlines.ends[0]), of_edge(outlines.ends[1])))
-    ground, shadow = _face_plane(corners), _shadow_plane(source, weight, start, end)
-    normal, foot, inverse = _line(ground, shadow)
+    ground, shadow = face_plane(corners), shadow_plane(source, weight, start, end)
+    normal, foot, inverse = line_of(ground, shadow)
     along = jnp.stack([-normal[1], normal[0]])
     low, high = stored_together((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
-    from_centre = _dot(foot, normal)
+    from_centre = dot_rows(foot, normal)
     centre_on_right = from_centre < 0
     # Where the centre's side is not what the image has, rounding has moved it over the line; or
     # what the line bounds is dark or lit for another reason.
@@ -403,21 +404,22 @@ def shadow_of(
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
-    depth = -_dot(ground.normal, point) / _nonzero(ground.offset)
+    depth = -dot_rows(ground.normal, point) / nonzero(ground.offset)
     planes = [
-        _end_plane(source, weight, shadow, end, start),
-        _end_plane(source, weight, shadow, start, end),
-        _edge_plane(shadow, start, end),
+        end_plane(source, weight, shadow, end, start),
+        end_plane(source, weight, shadow, start, end),
+        edge_plane(shadow, start, end),
     ]
     to_light = source - weight * start
     at = [start - end, end - start, to_light]
     shares = [
-        (_dot(plane.normal, point) + plane.offset * depth) / _nonzero(_dot(plane.normal, away))
+        (dot_rows(plane.normal, point) + plane.offset * depth)
+        / nonzero(dot_rows(plane.normal, away))
         for plane, away in zip(planes, at, strict=True)
     ]
     e, volume = edge_functions(corners, x, y)
     per_plane = (high - low) * inverse
-    turn = per_plane * shadow.offset / _nonzero(volume)
+    turn = per_plane * shadow.offset / nonzero(volume)
     motions = [-per_plane * ground.offset * share * shadow.normal for share in shares]
     weight_motion = -per_plane * ground.offset * shares[2] * shadow.offset
     corner_motions = [turn * value * ground.normal for value in e]
@@ -469,17 +471,8 @@ def light_told(
     return stored(jnp.where(cast.turned[:, face], told, 0))
 
 
-def _dot(a: Array, b: Array) -> Array:
-    """Row by row: a reduction of so few would be a call into a library."""
-    return reduce(add, [x * y for x, y in zip(a, b, strict=True)])
-
-
 def _cross(a: Array, b: Array) -> Array:
     return a[0] * b[1] - a[1] * b[0]
-
-
-def _nonzero(value: Array) -> Array:
-    return jnp.where(value == 0, 1, value)
 
 
 def _of_screen(motion: Array, pixel: Array) -> Array:
@@ -487,56 +480,6 @@ def _of_screen(motion: Array, pixel: Array) -> Array:
     x, y, w = motion
     column, row = pixel.astype(w.dtype) + 0.5
     return jnp.stack([x, y, w - column * x - row * y])
-
-
-def _through(normal: Array, place: Array) -> _Plane:
-    """The plane through a place; its normal is scaled to a largest component of one."""
-    normal = stored(normal / _nonzero(largest(normal)))
-    return _Plane(normal, -_dot(normal, place))
-
-
-def _face_plane(corners: Float[Array, "3 3 *n"]) -> _Plane:
-    """The plane of faces; its offset is not negative."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    plane = _through(cross_rows(b - a, c - a), a)
-    sign = jnp.where(plane.offset < 0, -1, 1)
-    return _Plane(sign * plane.normal, sign * plane.offset)
-
-
-def _shadow_plane(source: Array, weight: Array, start: Array, end: Array) -> _Plane:
-    return _through(cross_rows(source - weight * start, end - start), start)
-
-
-def _end_plane(source: Array, weight: Array, shadow: _Plane, start: Array, end: Array) -> _Plane:
-    """The plane through light and start at right angles to the shadow's; positive at the end."""
-    plane = _through(cross_rows(shadow.normal, source - weight * start), start)
-    sign = jnp.where(_dot(plane.normal, end - start) < 0, -1, 1)
-    return _Plane(sign * plane.normal, sign * plane.offset)
-
-
-def _edge_plane(shadow: _Plane, start: Array, end: Array) -> _Plane:
-    """The plane through the edge at right angles to the shadow's."""
-    return _through(cross_rows(end - start, shadow.normal), start)
-
-
-def _meet(ground: _Plane, plane: _Plane) -> Float[Array, "3 *n"]:
-    """The line a x + b y + c = 0 on the screen where planes meet: (a, b, c)."""
-    return ground.offset * plane.normal - plane.offset * ground.normal
-
-
-def _line(ground: _Plane, shadow: _Plane) -> tuple[Array, Array, Array]:
-    """Where planes meet on the screen: unit normal, and point next to the pixel's centre.
-
-    Also the factor that makes distances of what `_meet` tells, 0 where rounding leaves no line.
-    """
-    line = _meet(ground, shadow)
-    steepness = jnp.hypot(line[0], line[1])
-    size = largest(shadow.normal[:2]) * jnp.abs(ground.offset)
-    size = size + largest(ground.normal[:2]) * jnp.abs(shadow.offset)
-    steep = steepness > _ROUNDINGS * jnp.finfo(line.dtype).eps * size
-    inverse = 1 / jnp.where(steep, steepness, 1)
-    normal = line[:2] * inverse
-    return normal, -line[2] * inverse * normal, jnp.where(steep, inverse, 0)
 
 
 def _same_place(end: Array, others: list[Array]) -> Array:

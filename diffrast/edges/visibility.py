@@ -42,6 +42,7 @@ from diffrast.edges.planes import (
     area,
     beside_edge,
     corners_of,
+    dot_rows,
     edge_values,
     inverse_depth_slope,
 )
@@ -215,7 +216,7 @@ def look(
         for point, is_near, snap in zip((begin, end), at_end, snaps, strict=True)
     )
     by = jnp.where(at_end[0], begin, jnp.where(at_end[1], end, middle))
-    begin, end, to_right = stored_together((begin, end, -_dot(by, normal)))
+    begin, end, to_right = stored_together((begin, end, -dot_rows(by, normal)))
     depths = stored(depth[1, 0, :9] + half * (depth[1, 1, :9] - depth[1, 0, :9]))
     farther = (pictured[4] < 0) | (foreign[4] & (depths[4] * (1 + FINE_TOLERANCE) < near))
     farther = (pictured[4] == beyond) | (fold & farther)
@@ -225,7 +226,9 @@ def look(
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
     least = jnp.array(_TIE[1], near.dtype)
     # Of an edge that ends before the centre the one beyond its corner tells.
-    ends_before = (at_end[0] & (_dot(begin, along) > 0)) | (at_end[1] & (_dot(end, along) < 0))
+    ends_before = (at_end[0] & (dot_rows(begin, along) > 0)) | (
+        at_end[1] & (dot_rows(end, along) < 0)
+    )
     turned = close & ~ends_before & (outward * is_beyond * to_right < least)
     shift = stored(jnp.where(turned, outward * is_beyond * least - to_right, 0))
     centre_depth = -outward * (to_right + shift)
@@ -345,12 +348,8 @@ def _at(image: Int[Array, "height width"], column: Array, row: Array) -> Int[Arr
     return stored(image[row.clip(0, height - 1), column.clip(0, width - 1)].astype(jnp.int32))
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1]
-
-
 def _near(point: Array) -> Bool[Array, " n"]:
-    return _dot(point, point) < _BY**2
+    return dot_rows(point, point) < _BY**2
 
 
 def _snap(vertex: Float[Array, "2 n"], shape: tuple[int, ...]) -> Float[Array, "2 n"]:
