@@ -345,6 +345,27 @@ def test_edges_on_borders_and_through_centres_of_pixels_bound_their_exact_area(c
     np.testing.assert_allclose(np.ravel(got), want, atol=1e-4)
 
 
+def test_bodies_that_pierce_on_borders_and_through_centres_of_pixels_part_their_exact_area():
+    """A slope rises out of level ground along a column of pixels, in its middle or beside it."""
+    corners = np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [9.0, 9.0, 0.0], [-9.0, 9.0, 0.0]])
+    rising = corners + np.stack([0 * corners[:, 0], 0 * corners[:, 0], corners[:, 0]], axis=1)
+    ground, slope = (dr.Mesh(vertices=v, faces=[(0, 1, 2), (0, 2, 3)]) for v in (corners, rising))
+    black, white = (dr.Material(diffuse=(grey,) * 3) for grey in (0.0, 1.0))
+    view = dr.Camera.orthographic(eye=(0, 0, 20), target=(0, 0, 0), height=16.0, near=1, far=40)
+    settings = dr.RenderSettings(height=16, width=16, shading="unlit")
+
+    def rows(up):
+        lifted = dr.Object(ground, black, dr.linalg.translation(jnp.array([0.0, 0, 1]) * up))
+        scene = dr.Scene(objects=[lifted, dr.Object(slope, white)])
+        return dr.render(scene, view, settings)[..., 0].sum(axis=1)
+
+    lifts = jnp.array([0.0, 0.25, 0.5, 1.0])
+    images, changes = jax.lax.map(lambda up: jax.jvp(rows, (up,), (jnp.ones_like(up),)), lifts)
+    # Where the diagonals of both pass through a pixel's centre, .0012 is left.
+    np.testing.assert_allclose(images, np.repeat(8 - lifts[:, None], 16, axis=1), atol=2e-3)
+    np.testing.assert_allclose(changes, -1, atol=2e-4)
+
+
 def test_needles_that_pierce_a_wall_end_where_they_go_into_it():
     """A triangle that stands alone, of which a strip is seen between its edge and the wall."""
     size, pixel = 32, 2 / 32

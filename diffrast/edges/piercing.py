@@ -38,11 +38,12 @@ from diffrast.edges.neighborhood import (
     walk,
 )
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import TOLERANCE, Table, area, corners_of
+from diffrast.edges.planes import TOLERANCE, Table, area, corners_of, room_in_pixel
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 128
 _REACH = 0.75  # pixels from the centre: farther than the corners
+_HALF = 0.5001  # pixels: as far as a pixel reaches, and a little for lines along its border
 _THROUGH = 0.001  # pixels to both sides of the line that both faces reach
 _ROUNDINGS = 64  # in the slope of 1/w
 _FINE = 2.0  # square pixels: faces of half this area count as small ones
@@ -141,11 +142,11 @@ def cross(
     """
     planes, unit, met = _candidates(pixel, exists, surface, face_image, unseen)
     value, *slopes = planes.lambdas
-    reach = 0.5 * (abs(slopes[0]) + abs(slopes[1]))
+    reach = _HALF * (abs(slopes[0]) + abs(slopes[1]))
     near = planes.known & jnp.all(value + reach >= 0, axis=0) & exists
     body = stored(jnp.where(near, planes.body, -1))
     value, across, down = (part[:, None] - part for part in stored(_sums(planes.lambdas)))
-    meet = abs(value) <= 0.5 * (abs(across) + abs(down))
+    meet = abs(value) <= _HALF * (abs(across) + abs(down))
     differ = (body[:, None] != body) & (body[:, None] >= 0) & (body >= 0)
     # Of small faces only the two that were found to meet.
     coarse = stored(~planes.fine)
@@ -339,7 +340,7 @@ def lines_of(
     along = _left_of(normal)
 
     def inside(x: Array, y: Array) -> Array:
-        square = jnp.stack([0.5 - x, 0.5 + x, 0.5 - y, 0.5 + y])
+        square = jnp.stack(room_in_pixel(x, y))
         on_faces = jnp.where(whole, 1, at[0] + x * at[1] + y * at[2])
         return stored(jnp.concatenate([square, on_faces.reshape(6, *x.shape)]))
 
@@ -405,11 +406,12 @@ def _kept_aside(
 ) -> Array:
     """A line's point, moved past the pixel's centre if that shows the body on its other side.
 
-    Of small faces, whose planes are not quite their surfaces.
+    Of small faces, whose planes are not quite their surfaces; and of all as near as rounding.
     """
     to_front = -(point[0] * normal[0] + point[1] * normal[1])  # of the first face, as at the centre
     shown = jnp.where(at_centre == bodies[0], 1, jnp.where(at_centre == bodies[1], -1, 0))
-    moves = jnp.any(whole, axis=0) & (shown * to_front < 0)
+    close = jnp.abs(to_front) < _ASIDE
+    moves = (shown != 0) & (close | (jnp.any(whole, axis=0) & (shown * to_front < 0)))
     return stored(jnp.where(moves, -shown * (_ASIDE * normal), point))
 
 

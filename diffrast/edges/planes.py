@@ -17,6 +17,7 @@ TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
 _BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
 _ROUNDINGS = 8  # of a position, if that is more
+_TO_THE_LEFT = 2.0**-14  # pixels: as much as squares of pixels lie to the left of, and above, them
 
 Columns = list[Float[Array, "*n"]]
 Table = Float[Array, "3 V"]  # vertices in homogeneous pixel coordinates x, y, w
@@ -137,6 +138,20 @@ def area(corners: Array) -> Array:
     x, y = corners[:2] / jnp.where(before, corners[2], 1)
     twice = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     return jnp.where(before, abs(twice), jnp.inf)
+
+
+def room_in_pixel(x: Array, y: Array) -> list[Array]:
+    """Four values that are positive in a pixel, from its centre, and linear on the screen.
+
+    A line along the border between two pixels belongs to the one on its right, or below it, and by
+    so much that rounding does not give it to both, or to none.
+    """
+    return [
+        0.5 - _TO_THE_LEFT - x,
+        0.5 + _TO_THE_LEFT + x,
+        0.5 - _TO_THE_LEFT - y,
+        0.5 + _TO_THE_LEFT + y,
+    ]
 
 
 def beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:

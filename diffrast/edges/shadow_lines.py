@@ -31,6 +31,7 @@ from diffrast.edges.planes import (
     edge_functions,
     edge_values,
     largest,
+    room_in_pixel,
 )
 from diffrast.edges.shadow_planes import (
     Plane,
@@ -259,9 +260,6 @@ def cross_shadows(
 
     def inside(at: Array) -> list[Array]:
         x, y = at
-        # What runs along the border between two pixels belongs to one of them.
-        right, below = (jnp.where(room == 0, -tiny, room) for room in (0.5 - x, 0.5 - y))
-        square = [right, 0.5 + x, below, 0.5 + y]
         ends_here = [
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
@@ -270,9 +268,9 @@ def cross_shadows(
             jnp.where(ends_others[:, k, None], side * (way[0] * x + way[1] * y - least), 1)
             for k, (way, least) in enumerate(zip(outwards.swapaxes(0, 1), beyond, strict=True))
         ]
-        return square + ends_here + others
+        return room_in_pixel(x, y) + ends_here + others
 
-    zero, tiny = jnp.zeros_like(source[0]), jnp.finfo(source.dtype).tiny
+    zero = jnp.zeros_like(source[0])
     both_ends = foot - along, foot + along
     in_pixel = positive_part(*map(inside, both_ends))
     values = [edge_values(corners[:, :, None], x, y, near=(zero, zero))[0] for x, y in both_ends]
