@@ -126,6 +126,47 @@ def test_an_outline_on_the_border_between_pixels_belongs_to_one_of_them():
         np.testing.assert_allclose(np.sum(on_border[rows]), np.sum(near[rows]), rtol=0.25)
 
 
+def test_outlines_through_centres_of_pixels_bound_their_exact_area():
+    """Of quads whose shadows have sides and corners there, on a floor whose diagonal is, too."""
+    quads = np.array(
+        [
+            ((2.5, 2.5), (5.5, 2.5), (5.5, 5.5), (2.5, 5.5)),
+            ((2.5, 2.0), (5.5, 2.0), (5.5, 5.0), (2.5, 5.0)),
+            ((2.5, 2.5), (4.5, 0.5), (6.5, 2.5), (4.5, 4.5)),
+            ((2.5, 2.5), (5.5, 1.5), (6.5, 4.5), (3.5, 5.5)),
+            ((2.5, 2.5), (5.3, 2.9), (5.5, 5.5), (2.1, 4.5)),
+            ((2.0, 2.0), (5.0, 2.0), (5.0, 5.0), (2.0, 5.0)),
+        ]
+    )
+    camera = dr.Camera.orthographic(eye=(0, 0, 20), target=(0, 0, 0), height=16.0, near=1, far=40)
+    light = dr.DirectionalLight(direction=(1.0, 0.0, -1.0), shadow=dr.Shadow(resolution=64))
+    options = dr.RenderSettings(height=16, width=16, shading="flat")
+
+    def picture(quad):
+        """How dark the floor is, right of the quad itself, that hovers 8 above it."""
+        corners = jnp.concatenate([quad - jnp.array([8.0, 0.0]), jnp.full((4, 1), 8.0)], axis=1)
+        thing = dr.Object(dr.Mesh(vertices=corners, faces=[(0, 1, 2), (0, 2, 3)]))
+        scene = dr.Scene(objects=[thing, dr.Object(shapes.plane(72, 72))], lights=[light])
+        image = dr.render(scene, camera, options)[:, 8:, 0]
+        return 1 - image / jax.lax.stop_gradient(image[0, -1])
+
+    def area_of(quad):
+        (x, y), (x_next, y_next) = quad.T, np.roll(quad, -1, axis=0).T
+        return np.sum(x * y_next - y * x_next) / 2
+
+    def value_and_derivative(quad):
+        dark, pull_back = jax.vjp(picture, quad)
+        return dark, pull_back(jnp.ones_like(dark))[0]
+
+    pictures, derivatives = jax.lax.map(value_and_derivative, jnp.asarray(quads, jnp.float32))
+    steps = 1e-3 * np.eye(8).reshape(8, 4, 2)
+    for quad, dark, got in zip(quads, pictures, derivatives, strict=True):
+        assert np.max(dark) < 1 + 1e-5
+        np.testing.assert_allclose(np.sum(dark), area_of(quad), atol=5e-3)
+        want = [(area_of(quad + step) - area_of(quad - step)) / 2e-3 for step in steps]
+        np.testing.assert_allclose(np.ravel(got), want, atol=1e-3)
+
+
 def test_outlines_under_a_lens():
     """A lens bends where vertices are shown, not where a lamp stands, far out of what it shows."""
     size = 40

@@ -155,7 +155,8 @@ def _told(
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
-    only that it is dark beyond. Of points whose colours are not used no light is asked.
+    only that it is dark beyond. Where an outline may cross a crease, both sides have the light of
+    the pixel's centre. Of points whose colours are not used no light is asked.
     """
     if view.cast is None:
         return None
@@ -163,6 +164,11 @@ def _told(
         light_told(view.cast, view.face_image, pixel, side.face)
         for side in (found.front, found.beyond)
     )
+    column, row = pixel + 1
+    here = view.cast.lit[:, row, column].astype(front.dtype)
+    shown = found.front.is_centre | found.beyond.is_centre
+    crossed = ~found.fold & shown & (front < 0) & (beyond < 0)
+    front, beyond = jnp.where(crossed, here, jnp.stack([front, beyond]))
     front = jnp.where(found.fold, -1, front)
     beyond = jnp.where(found.fold & (beyond > 0), -1, beyond)
     inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
@@ -282,7 +288,7 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
     own = stored(_colors(view.image, _place(view, line.pixel, 4)))
     to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
-    value = area * jump + jnp.where(line.wrong_side, to_other, 0)
+    value = area * jump
     held = own, own + to_other
     leaves = area, line.look[1], line.look[0]
     sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held, leaves)

@@ -55,7 +55,10 @@ _REACH = 0.75  # pixels from the centre: farther than the corners
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
+_ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
+_BLUNT = 0.05  # cosine: of sharper corners the sides are moved less far than that takes
 _FLAT = 0.1  # pixels: how far lines on faces that count as one plane may be apart
+_ONE_LINE = 1e-3  # pixels: how far lines on two faces that are one may be apart
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
 # Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
@@ -102,6 +105,7 @@ class Outlines(NamedTuple):
     looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
     centre_is_lit: Bool[Array, " n"]  # in the image
     alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light
+    shift: Float[Array, "2 n"]  # of all lines of a pixel: see `_past_centre`
     range: Float[Array, "2 edges faces n"]  # begin and end, from the point next to the centre
     lines: Int[Array, " list"]  # (edge * faces + face) * n + number of the pixel
     total: Int[Array, ""]  # of lines
@@ -118,7 +122,6 @@ class Shadow(NamedTuple):
     look: Int[Array, "2 n"]  # 0 to 8: pixels on the right and on the left
     lit_on_right: Bool[Array, " n"]
     centre_is_lit: Bool[Array, " n"]  # in the image
-    wrong_side: Bool[Array, " n"]  # the image has the centre on the other side of the line
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
     vertices: Int[Array, "4 2 n"]  # start and end of the edge; the face's corners; the light; and
@@ -282,8 +285,12 @@ def cross_shadows(
     low, high = _continued(
         _common(in_pixel, on_face), _common(in_pixel, on_surface), usable, foot, along
     )
-    drawn = (chosen[:, None] & usable & (low < high)).reshape(_EDGES * _FACES, -1)
-    lines, total = selected(drawn)
+    drawn = chosen[:, None] & usable & (low < high)
+    range_ = stored(_REACH * (2 * jnp.stack([low, high]) - 1))
+    alone = counts[4] & (jnp.sum(drawn, axis=(0, 1)) == 1)
+    passed = alone | ((range_[0] < _ROUNDED) & (range_[1] > -_ROUNDED))
+    passed = drawn & counts[4] & passed & (jnp.abs(beyond) < _ROUNDED)
+    lines, total = selected(drawn.reshape(_EDGES * _FACES, -1))
     return Outlines(
         places=places,
         face=ground_face,
@@ -295,8 +302,9 @@ def cross_shadows(
         lit_on_right=lit_on_right,
         looks=looks,
         centre_is_lit=lit[4],
-        alone=counts[4] & (jnp.sum(drawn, axis=0) == 1),
-        range=_REACH * (2 * jnp.stack([low, high]) - 1),
+        alone=alone,
+        shift=_past_centre(outwards, beyond, passed, lit[4]),
+        range=range_,
         lines=lines,
         total=total,
     )
@@ -330,7 +338,8 @@ def _continued(
     """Begins and ends of lines on faces, 0 to 1, where other faces are not known.
 
     What is not on its `own` face goes on in that face's plane, as far as there is `room`, before
-    the first one of the faces and behind each up to the next.
+    the first one of the faces and behind each up to the next. Along an edge between two it is on
+    one of them.
     """
     low, high = own
     here = usable & (low < high)
@@ -343,6 +352,13 @@ def _continued(
     later = here[:, None] & (
         (other > one) | ((other == one) & (jnp.arange(_FACES)[:, None] > order))
     )
+    aside = _cross(axis, foot) / _REACH
+    beside = jnp.abs(aside[:, :, None] - aside[:, None]) < _ONE_LINE
+    again = jnp.any(
+        here[:, :, None] & later & beside & (2 * begin[:, None] < middle[:, :, None]), axis=1
+    )
+    here, later = here & ~again, later & ~again[:, None]
+    low, high = jnp.where(again, 1, low), jnp.where(again, 0, high)
     following = jnp.min(jnp.where(later, begin[:, None], jnp.inf), axis=2)
     first = here & (jnp.sum(later, axis=2) == jnp.sum(here, axis=1, keepdims=True) - 1)
     alike = step > 0.5 * dot_rows(axis, axis)  # in direction
@@ -357,6 +373,26 @@ def _continued(
     low = jnp.where((first & alike) | alone, room[0], low)
     high = jnp.where(here & alike, longer, jnp.where(alone, room[1], high))
     return stored((low, high))
+
+
+def _past_centre(
+    outwards: Float[Array, "2 edges faces n"],
+    beyond: Float[Array, "edges faces n"],
+    passed: Bool[Array, "edges faces n"],
+    is_lit: Bool[Array, " n"],
+) -> Float[Array, "2 n"]:
+    """How far lines that pass a pixel's centre are moved, to have it on the side that it shows.
+
+    Rounding decides else where lines through a centre have it. All of a pixel are moved alike, so
+    that corners stay whole; `outwards`, from dark to lit, and how far out they lie as there.
+    """
+    side = jnp.where(is_lit, -1, 1)
+    way = jnp.sum(jnp.where(passed, outwards, 0), axis=(1, 2))
+    size = jnp.hypot(*way)
+    way = way / jnp.where(size > 0, size, 1)
+    gained = jnp.maximum(dot_rows(outwards, way[:, None, None]), _BLUNT)
+    lacking = jnp.where(passed, (_ASIDE - side * beyond) / gained, 0)
+    return stored(side * jnp.clip(jnp.max(lacking, axis=(0, 1)), 0, 2 * _ROUNDED) * way)
 
 
 @jax.jit
@@ -389,16 +425,14 @@ def shadow_of(
     start, end = stored_together((of_edge(outlines.ends[0]), of_edge(outlines.ends[1])))
     ground, shadow = face_plane(corners), shadow_plane(source, weight, start, end)
     normal, foot, inverse = line_of(ground, shadow)
+    foot = foot + stored(outlines.shift[:, place])
     along = jnp.stack([-normal[1], normal[0]])
     low, high = stored_together((one(outlines.range[0]), one(outlines.range[1])))
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
-    from_centre = dot_rows(foot, normal)
-    centre_on_right = from_centre < 0
-    # Where the centre's side is not what the image has, rounding has moved it over the line; or
-    # what the line bounds is dark or lit for another reason.
+    centre_on_right = dot_rows(foot, normal) < 0
+    # What a line bounds may be dark or lit for another reason.
     wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
-    near = jnp.abs(from_centre) < _ROUNDED
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
@@ -432,13 +466,12 @@ def shadow_of(
     return Shadow(
         pixel=pixel,
         light=light,
-        used=exists & (near | ~wrong_side),
+        used=exists & ~wrong_side,
         face=face,
         barycentrics=barycentrics(e),
         look=jnp.where(lit_on_right, looks, looks[::-1]),
         lit_on_right=lit_on_right,
         centre_is_lit=centre_is_lit,
-        wrong_side=wrong_side,
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
         vertices=jnp.stack(vertices).reshape(4, 2, -1),
