@@ -178,6 +178,40 @@ def test_boxes_in_a_row_have_no_seam(whole):
             np.testing.assert_allclose(smooth(view), sampled(view), atol=0.03)
 
 
+def test_boxes_seen_from_straight_above_have_exact_edges():
+    """Black walls, seen edge-on, of white boxes on a floor whose diagonals pass by their corners.
+
+    What is seen in a pixel is a product of shares of its row and its column, also where corners
+    lie at its centre and edges near the picture's border.
+    """
+    size, rng = 16, np.random.default_rng(0)
+    view = dr.Camera.orthographic(eye=(0, 0, 20), target=(0, 0, 0), height=size, near=1, far=60)
+    above = dr.DirectionalLight(direction=(0, 0, -1))
+    settings = dr.RenderSettings(height=size, width=size, shading="flat")
+    grey = dr.Object(dr.shapes.plane(60, 60), dr.Material(diffuse=(0.5, 0.5, 0.5)))
+    white = dr.Material(diffuse=(1.0, 1.0, 1.0))
+    # Only that depths are no round numbers.
+    higher = dr.Object(dr.shapes.cube(), white, dr.linalg.translation((100, 0, 20)))
+
+    @jax.jit
+    def from_above(low, high):
+        placed = dr.linalg.compose(
+            dr.linalg.translation((low + high) / 2), dr.linalg.scaling((high - low) / 2)
+        )
+        objects = [dr.Object(dr.shapes.cube(), white, placed), grey, higher]
+        return dr.render(dr.Scene(objects=objects, lights=[above]), view, settings)[..., 0]
+
+    at = np.arange(size) - size / 2
+    for start, more in rng.integers((-15, -15, 1), (4, 4, 5), (200, 2, 3)):
+        low = start / (2, 2, 1)
+        high = low + (np.abs(more) + 2) / (2, 2, 1)
+        columns, rows = (
+            np.maximum(np.minimum(high[i], at + 1) - np.maximum(low[i], at), 0) for i in range(2)
+        )
+        want = 0.5 + 0.5 * rows[::-1, None] * columns
+        np.testing.assert_allclose(from_above(low, high), want, atol=0.01)
+
+
 def test_bodies_that_lie_in_one_another_have_no_line_in_common():
     """A cube twice, in two colours: nothing changes where nothing does with one in view."""
     cube = dr.shapes.cube()
@@ -420,7 +454,7 @@ def test_straight_ways_end_where_the_surface_does(straight):
     pixels = jnp.asarray(points, jnp.float32)
     topology = jax.tree.map(jnp.asarray, topology_of(points.T, faces))
     faces = jnp.asarray(faces)
-    surface = Surface(faces, pixels, topology, facing(pixels, faces))
+    surface = Surface(faces, pixels, topology, facing(pixels, faces, height=3, width=3))
     start = jnp.array([6])  # left of the hole
     reached, there = walk(start, jnp.array([2.3]), jnp.array([0.6]), surface, straight=straight)
     assert there.all()
@@ -452,7 +486,7 @@ def clipped_edges(clip, size):
     """Vertices of loose triangles in pixels, which way these face, and their clipped edges."""
     faces = jnp.arange(len(clip)).reshape(-1, 3)
     pixels = to_pixels(clip, size, size)
-    volume = facing(pixels, faces)
+    volume = facing(pixels, faces, height=size, width=size)
     edges = traced_topology(clip, faces).edges
     number = jnp.arange(faces.size)
     segments = clip_edges(

@@ -167,7 +167,8 @@ def with_depth(view: View) -> View:
     positions_clip = view.positions_clip * scale[:, None]
 
     def volume_of(positions_clip: Array, faces: Array) -> Array:
-        return facing(stored(to_pixels(positions_clip, height, width)), faces)
+        pixels = stored(to_pixels(positions_clip, height, width))
+        return facing(pixels, faces, height=height, width=width)
 
     volume = over_views(volume_of, height * width)(lax.stop_gradient(positions_clip), view.faces)
     if view.cast is not None:

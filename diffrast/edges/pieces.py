@@ -34,7 +34,8 @@ PIECES_AT_ONCE = 256, 512
 OF_MANY_VIEWS = 128  # where others would wait for the view that has most
 FEW = 32  # pieces, each of which is looked at in parts
 RUNS = 32  # of an edge's pieces, for each of which there is a bit
-_EDGE_ON = 8  # roundings in the volume of a face
+_EDGE_ON = 8  # roundings in the volume of a face,
+_PLACED = 2  # and in where its vertices are
 
 
 class AtOnce(NamedTuple):
@@ -148,13 +149,18 @@ def scale_by_depth(depth: Depth, positions_clip: Float[Array, "V 4"]) -> Float[A
     return 1 / jnp.where(known, depth.weight(safe), 1)
 
 
-@jax.jit
-def facing(pixels: Table, faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
+@partial(jax.jit, static_argnames=("height", "width"))
+def facing(
+    pixels: Table, faces: Int[Array, "F 3"], *, height: int, width: int
+) -> Float[Array, " F"]:
     """Volume det(v0, v1, v2) of x, y, w: negative on front faces, as y points down.
 
     Zero for faces seen edge-on, as far as rounding can tell, and for those with a vertex at the
     eye. But if their outlines touch, as those of faces without area do, they count as front faces:
     so one of the faces beside them has an outline there, and not both.
+
+    Vertices are known to some roundings of the picture's size, also near its left and upper border
+    where x and y are small; by how much that changes the volume other corners tell.
     """
     first, second, third = nearest_first(stored_together([pixels[:, column] for column in faces.T]))
     one, other = second - first, third - first
@@ -164,11 +170,16 @@ def facing(pixels: Table, faces: Int[Array, "F 3"]) -> Float[Array, " F"]:
     volume, size = (sum(t[1:], t[0]) for t in (terms, [abs(term) for term in terms]))
     info = jnp.finfo(size.dtype)
     at_eye = largest(first) <= info.eps**1.5 * jnp.maximum(largest(second), largest(third))
-    seen = jnp.maximum(largest(cross_rows(first, one)), largest(cross_rows(first, other)))
-    thin = largest(cross_rows(one, other)) <= FINE_TOLERANCE * seen
+    beside = [cross_rows(first, one), cross_rows(first, other)]
+    across = cross_rows(one, other)
+    seen = jnp.maximum(*map(largest, beside))
+    thin = largest(across) <= FINE_TOLERANCE * seen
     hardly = jnp.where(thin & ~at_eye, -info.tiny, 0)
-    known = (abs(volume) > _EDGE_ON * info.eps * size) & ~at_eye
-    return stored(jnp.where(known, volume, hardly))
+    extent = jnp.array([width, height, 1], size.dtype)[:, None]
+    nearest, *farther = (jnp.maximum(abs(v), abs(v[2]) * extent) for v in (first, second, third))
+    moved = nearest * abs(across) + jnp.maximum(*farther) * (abs(beside[0]) + abs(beside[1]))
+    rounding = info.eps * (_EDGE_ON * size + _PLACED * (moved[0] + moved[1] + moved[2]))
+    return stored(jnp.where((abs(volume) > rounding) & ~at_eye, volume, hardly))
 
 
 def _sides(edges: Edges, volume: Array) -> tuple[Array, Array, Array]:

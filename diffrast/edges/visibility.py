@@ -181,6 +181,8 @@ def look(
     first, last = pieces.range
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
     exists = pieces.exists & (part.begin < part.end)
+    # A rest too short to be looked at belongs to it: a gap may be most of what a centre sees.
+    high = jnp.where((end - high) * length > SHORT, high, jnp.maximum(high, end))
     # Of a part that rounding makes nothing of, what follows is left all the same, and is less.
     following = jnp.maximum(high, first * (1 + jnp.finfo(first.dtype).eps))
     left = pieces._replace(

@@ -164,8 +164,9 @@ def parted(
     positions_clip: Float[Array, "V 4"],
 ) -> Parted:
     """Count the pairs between which `outlines` looked for edges, and those with one."""
-    pixels = to_pixels(positions_clip, *points.face.shape)
-    volume = facing(pixels, geometry.faces)
+    height, width = points.face.shape
+    pixels = to_pixels(positions_clip, height, width)
+    volume = facing(pixels, geometry.faces, height=height, width=width)
     shadowed = ~lit & shone_on(lights, shadows, points)
     patch = jnp.where(points.face >= 0, topology.patches[jnp.maximum(points.face, 0)], -1)
     one_surface = _side_by_side(patch, jnp.equal) & _side_by_side(lit, jnp.not_equal)
