@@ -118,10 +118,10 @@ def _program(
     structure: Any,
     kinds: Kinds,
     devices: tuple[jax.Device, ...],
-    number: np.dtype,
+    in_use: tuple[np.dtype, Any],
 ) -> Callable[..., Any]:
-    """The compiled loop over a chunk of views; `number` is the kind of numbers in use."""
-    del number
+    """The compiled loop over a chunk of views; with the kind of numbers and the device in use."""
+    del in_use
     split = PartitionSpec(AXIS)
 
     def on_each(shared: Any, views: Any, number: Array) -> Any:
@@ -185,7 +185,10 @@ def in_order(
 
     leaves, structure = jax.tree.flatten((shared, chunk(0)))
     kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    program = _program(work, function, structure, kinds, devices, jnp.result_type(float))
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    in_use = jnp.result_type(float), device
+    program = _program(work, function, structure, kinds, devices, in_use)
+    shared = _placed(shared, program)
 
     def draw(first: int) -> Any:
         result = program(shared, chunk(first), np.int32(min(each, count - first)))
@@ -204,6 +207,19 @@ def in_order(
                 yield number, result.result()
         for number, result in waiting:
             yield number, result.result()
+
+
+def _placed(shared: Any, program: Any) -> Any:
+    """Arrays that somebody has put on other devices than the program's, on these."""
+
+    def placed(x: Array, sharding: Any) -> Array:
+        there = sharding is None or x.sharding.is_equivalent_to(sharding, x.ndim)
+        # What nobody has put anywhere JAX moves by itself.
+        free = not x.committed or not x.is_fully_addressable
+        return x if free or there else jax.device_put(x, sharding)
+
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(placed, shared, program.input_shardings[0][0])
 
 
 def _rows(x: Any) -> np.ndarray:

@@ -106,7 +106,7 @@ def map_views(
         function: `function(shared, view)` of arrays, as `jax.jit` takes it, to a tree of arrays
             and numbers; pass the same object again and it is compiled once.
         views: a tree of arrays with a common leading axis.
-        shared: a tree of arrays that all views have in common.
+        shared: a tree of arrays that all views have in common, on any device.
         chunk: as in `render_views`.
         devices: as in `render_views`.
 

@@ -158,6 +158,43 @@ def test_the_number_of_devices_changes_no_bit():
     subprocess.run([sys.executable, "-c", MANY_DEVICES], check=True, cwd="tests")
 
 
+PLACED = """
+import jax, numpy as np
+jax.config.update("jax_num_cpu_devices", 4)
+import test_views as t
+from diffrast import _chunks, views
+from jax.sharding import NamedSharding, PartitionSpec
+
+devices = jax.devices()
+places = np.linspace(0, 1, 5, dtype=np.float32)
+mesh = jax.make_mesh((4,), ("some",))
+everywhere, split = (NamedSharding(mesh, PartitionSpec(*axis)) for axis in ((), ("some",)))
+for work in (views.map_views, views.sum_views):
+    want = work(t.wave, places, np.float32(3))
+    for where in (devices[1], everywhere):
+        three = jax.device_put(np.float32(3), where)
+        for on in (None, devices, devices[2:]):
+            got = work(t.wave, jax.device_put(places, where), three, devices=on)
+            np.testing.assert_array_equal(got, want)
+        got = jax.jit(lambda x: x * work(t.wave, places, three))(1.0)
+        np.testing.assert_array_equal(got, want)
+    rows = np.arange(28, dtype=np.float32).reshape(4, 7)
+    product = lambda rows, place: rows * place
+    got = work(product, places, jax.device_put(rows, split), devices=devices[:2])
+    np.testing.assert_array_equal(got, work(product, places, rows))
+    programs = _chunks._program.cache_info().misses
+    with jax.default_device(devices[3]):  # needs a program of its own
+        got = work(t.wave, places, np.float32(3))
+    np.testing.assert_array_equal(got, want)
+    assert got.devices() == {devices[3]}
+    assert _chunks._program.cache_info().misses == programs + 1
+"""
+
+
+def test_what_views_share_may_lie_on_any_device():
+    subprocess.run([sys.executable, "-c", PLACED], check=True, cwd="tests")
+
+
 TWO_PROCESSES = """
 import sys
 import jax, numpy as np
