@@ -5,10 +5,11 @@ can only be checked where they are known: a traced array passes.
 """
 
 import contextlib
+import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,9 @@ from jax.typing import ArrayLike
 
 # What a public function may be given where it wants an array: also lists and tuples of numbers.
 ArrayInput: TypeAlias = ArrayLike | Sequence[Any]
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def is_concrete(value: Any) -> bool:
@@ -39,6 +43,21 @@ def staying_known(*values: Any) -> contextlib.AbstractContextManager[None]:
     """
     known = all(is_concrete(leaf) for leaf in jax.tree.leaves(values))
     return jax.ensure_compile_time_eval() if known else contextlib.nullcontext()
+
+
+def known_of_known(function: Callable[P, T]) -> Callable[P, T]:
+    """A function that makes something known of known arguments, inside of `jax.jit` too."""
+
+    @functools.wraps(function)
+    def whole(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            context = staying_known(args, kwargs)
+        except Exception:  # of what is no tree the function makes an error that tells more
+            context = contextlib.nullcontext()
+        with context:
+            return function(*args, **kwargs)
+
+    return whole
 
 
 def float_array(

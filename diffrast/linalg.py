@@ -30,7 +30,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from diffrast._check import ArrayInput, float_array, is_concrete, staying_known
+from diffrast._check import ArrayInput, float_array, is_concrete, known_of_known, staying_known
 from diffrast._stored import stored
 
 _FEW = range(2, 5)  # components of a vector
@@ -129,12 +129,14 @@ def _joined(parts: list[Array]) -> Array:
 # -------------------------------------------------------------------------- building transforms
 
 
+@known_of_known
 def translation(offset: ArrayInput) -> Float[Array, "4 4"]:
     """Matrix that moves points by `offset` (3,). FEATURES T1."""
     offset = float_array("offset", offset, (3,))
     return _homogeneous(jnp.eye(3, dtype=offset.dtype), offset)
 
 
+@known_of_known
 def scaling(factors: ArrayInput) -> Float[Array, "4 4"]:
     """Matrix that scales x, y, z by `factors`: one number or three. FEATURES T1."""
     factors = float_array("factors", factors)
@@ -143,6 +145,7 @@ def scaling(factors: ArrayInput) -> Float[Array, "4 4"]:
     return _homogeneous(jnp.diag(jnp.broadcast_to(factors, (3,))))
 
 
+@known_of_known
 def rotation(axis: ArrayInput, angle: ArrayLike) -> Float[Array, "4 4"]:
     """Right-handed rotation by `angle` about `axis` (3,) of any length. FEATURES T1.
 
@@ -161,16 +164,19 @@ def rotation(axis: ArrayInput, angle: ArrayLike) -> Float[Array, "4 4"]:
     return _homogeneous(eye + jnp.sin(angle) * turn + versine * _matmul(turn, turn))
 
 
+@known_of_known
 def rotation_x(angle: ArrayLike) -> Float[Array, "4 4"]:
     """Rotation about the x axis, y towards z. FEATURES T1."""
     return _axis_rotation(0, angle)
 
 
+@known_of_known
 def rotation_y(angle: ArrayLike) -> Float[Array, "4 4"]:
     """Rotation about the y axis, z towards x. FEATURES T1."""
     return _axis_rotation(1, angle)
 
 
+@known_of_known
 def rotation_z(angle: ArrayLike) -> Float[Array, "4 4"]:
     """Rotation about the z axis, x towards y. FEATURES T1."""
     return _axis_rotation(2, angle)
@@ -185,6 +191,7 @@ def _axis_rotation(axis: int, angle: ArrayLike) -> Array:
     return matrix.at[second, first].set(sine).at[first, second].set(-sine)
 
 
+@known_of_known
 def shear(
     *,
     xy: ArrayLike = 0.0,
@@ -203,6 +210,7 @@ def shear(
     return _homogeneous(jnp.stack(entries).reshape(3, 3))
 
 
+@known_of_known
 def compose(*matrices: ArrayInput) -> Float[Array, "4 4"]:
     """Product of 4x4 matrices: the rightmost acts first. None at all is the identity.
 

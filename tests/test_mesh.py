@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from diffrast import _topology
 from diffrast import mesh as dm
 from diffrast._topology import clip_ears
-from diffrast.linalg import rotation_y, scaling
+from diffrast.linalg import compose, rotation_y, scaling, translation
 from diffrast.mesh import Mesh
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)
@@ -455,7 +455,10 @@ def test_known_meshes_are_made_inside_of_jit():
         uvs, uv_faces = np.zeros((3, 2)), [[0, 1, 2], [2, 1, 0]]
         made = dm.from_polygons(corners, [[0, 1, 2, 3]])
         with_uvs = Mesh(vertices=made.vertices, faces=made.faces, uvs=uvs, uv_faces=uv_faces)
-        return made, dm.split_uvs(with_uvs), dm.merge_near_vertices(made, 1e-3)
+        turned = dm.transform(made, compose(rotation_y(1), scaling(2), translation((0, 0, 1))))
+        edited = turned, dm.with_normals(made), dm.flat_shaded(made), dm.merge([made, turned])
+        assert all(mesh.topology is not None for mesh in edited)
+        return made, dm.split_uvs(with_uvs), dm.merge_near_vertices(made, 1e-3), *edited
 
     for inside, outside in zip(jax.jit(meshes)(), meshes(), strict=True):
         assert jax.tree.structure(inside) == jax.tree.structure(outside)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -306,3 +308,23 @@ def test_sizes_and_heights_are_differentiable():
 def test_shapes_refuse(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_shapes_of_known_sizes_are_known_inside_of_jit():
+    """Their edges, too: else these are found at every call, and each corner gets a copy."""
+    makers = [shapes.cube, shapes.tetrahedron, shapes.octahedron, shapes.icosahedron]
+    makers += [shapes.dodecahedron, shapes.buckyball, shapes.plane, shapes.uv_sphere]
+    makers += [shapes.cylinder, shapes.cone, shapes.torus, partial(shapes.icosphere, 1)]
+    makers += [partial(shapes.height_field, np.eye(3)), partial(shapes.menger_sponge, 1)]
+    makers += [lambda: shapes.fractal(shapes.cube(), 1), partial(shapes.teapot, 2)]
+
+    def all_of_them():
+        meshes = [make() for make in makers]
+        assert all(mesh.topology is not None for mesh in meshes)
+        return meshes
+
+    inside, outside = jax.jit(all_of_them)(), all_of_them()
+    assert jax.tree.structure(inside) == jax.tree.structure(outside)
+    jax.tree.map(np.testing.assert_array_equal, inside, outside)
+    traced = jax.jit(lambda size: shapes.plane(size).vertices)(2.0)
+    np.testing.assert_array_equal(traced, shapes.plane().vertices)

@@ -77,6 +77,7 @@ def from_polygons(
         )
 
 
+@_check.known_of_known
 def merge(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh of all the faces, in order. Differentiable in all of them.
 
@@ -144,6 +145,7 @@ def stack_meshes(meshes: Sequence[Mesh]) -> Mesh:
     return jax.tree_util.tree_map_with_path(stacked, *alike)
 
 
+@_check.known_of_known
 def transform(mesh: Mesh, matrix: ArrayInput) -> Mesh:
     """Apply a 4×4 affine matrix, differentiable in mesh and matrix.
 

@@ -76,6 +76,7 @@ def weld(vertices: ArrayInput) -> Int[Array, "vertices"] | Int[np.ndarray, "vert
     return _topology.representatives(lax.stop_gradient(positions), jnp)
 
 
+@_check.known_of_known
 def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> Mesh:
     """The same mesh with smooth vertex normals; see `vertex_normals`.
 
@@ -95,6 +96,7 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
 _weld = weld  # `weld` is also the name of an option
 
 
+@_check.known_of_known
 def flat_shaded(mesh: Mesh) -> Mesh:
     """Give each face its own three vertices, with the face's normal as theirs."""
     _check.instance_of("mesh", mesh, Mesh)

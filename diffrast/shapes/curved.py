@@ -20,6 +20,7 @@ from diffrast.shapes._grid import grid_faces, grid_uvs, two_counts, unit_circle
 from diffrast.shapes.solids import icosahedron_arrays
 
 
+@_check.known_of_known
 def icosphere(subdivisions: int = 3, radius: ArrayLike = 1.0) -> Mesh:
     """Sphere of 20·4ⁿ nearly equal triangles: an icosahedron cut n times (Van Houdt 8).
 
@@ -45,6 +46,7 @@ def _subdivide(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.concatenate([unit, middles]), parts.reshape(-1, 3)
 
 
+@_check.known_of_known
 def uv_sphere(radius: ArrayLike = 1.0, *, segments: int = 32, rings: int = 16) -> Mesh:
     """Sphere of meridians and parallels, with texture coordinates.
 
@@ -78,6 +80,7 @@ def uv_sphere(radius: ArrayLike = 1.0, *, segments: int = 32, rings: int = 16) -
     )
 
 
+@_check.known_of_known
 def plane(
     width: ArrayLike = 2.0, height: ArrayLike = 2.0, *, divisions: int | tuple[int, ...] = 1
 ) -> Mesh:
@@ -97,6 +100,7 @@ def plane(
     return Mesh(vertices=scale * unit, faces=grid_faces(columns, rows), normals=normals, uvs=uvs)
 
 
+@_check.known_of_known
 def cylinder(
     radius: ArrayLike = 1.0,
     height: ArrayLike = 2.0,
@@ -128,6 +132,7 @@ def cylinder(
     return Mesh(vertices=scale * vertices, faces=faces, normals=normals, uvs=uvs)
 
 
+@_check.known_of_known
 def cone(
     radius: ArrayLike = 1.0, height: ArrayLike = 2.0, *, segments: int = 32, caps: bool = True
 ) -> Mesh:
@@ -168,6 +173,7 @@ def cone(
     )
 
 
+@_check.known_of_known
 def torus(
     major_radius: ArrayLike = 1.0,
     minor_radius: ArrayLike = 0.4,
@@ -197,6 +203,7 @@ def torus(
     )
 
 
+@_check.known_of_known
 def height_field(heights: ArrayInput, width: ArrayLike = 2.0, height: ArrayLike = 2.0) -> Mesh:
     """Surface z = heights over a rectangle, facing +z, differentiable in the heights.
 

@@ -15,6 +15,7 @@ from diffrast.mesh import Mesh, flat_shaded, weld
 _MOST_FACES = 1 << 24
 
 
+@_check.known_of_known
 def fractal(mesh: Mesh, iterations: int, scale: ArrayLike = 3.0) -> Mesh:
     """Replace a solid by smaller ones at its corners, some times over.
 
@@ -67,6 +68,7 @@ def fractal(mesh: Mesh, iterations: int, scale: ArrayLike = 3.0) -> Mesh:
     )
 
 
+@_check.known_of_known
 def menger_sponge(level: int, *, interior: bool = False, flat: bool = True) -> Mesh:
     """Menger sponge with corners (±1, ±1, ±1): 20^level cubes, each 3^-level as large.
 

@@ -16,6 +16,7 @@ from diffrast import _check
 from diffrast.mesh import Mesh, flat_shaded
 
 
+@_check.known_of_known
 def cube(*, flat: bool = True) -> Mesh:
     """Cube with corners (±1, ±1, ±1): edges of length 2, 12 triangles."""
     corners = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -23,12 +24,14 @@ def cube(*, flat: bool = True) -> Mesh:
     return _solid(np.array(corners), np.array(squares), flat)
 
 
+@_check.known_of_known
 def tetrahedron(*, flat: bool = True) -> Mesh:
     """Tetrahedron on four corners of the cube: edges of length 2√2."""
     corners = [[1, -1, -1], [-1, 1, -1], [1, 1, 1], [-1, -1, 1]]
     return _solid(np.array(corners), np.array([[0, 1, 2], [1, 3, 2], [0, 2, 3], [0, 3, 1]]), flat)
 
 
+@_check.known_of_known
 def octahedron(*, flat: bool = True) -> Mesh:
     """Octahedron with corners ±1 on the axes: edges of length √2."""
     corners = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1], [0, 0, 1]]
@@ -39,11 +42,13 @@ def octahedron(*, flat: bool = True) -> Mesh:
     return _solid(np.array(corners), np.concatenate([upper, lower]), flat)
 
 
+@_check.known_of_known
 def icosahedron(*, flat: bool = True) -> Mesh:
     """Icosahedron in the unit sphere, two corners on the z axis: 20 faces."""
     return _solid(*icosahedron_arrays(), flat)
 
 
+@_check.known_of_known
 def dodecahedron(*, flat: bool = True) -> Mesh:
     """Dodecahedron in the unit sphere, the dual of `icosahedron`: 12 pentagons, 36 triangles."""
     corners, triangles = icosahedron_arrays()
@@ -57,6 +62,7 @@ def dodecahedron(*, flat: bool = True) -> Mesh:
     return _solid(unit, np.concatenate(rings), flat)
 
 
+@_check.known_of_known
 def buckyball(*, flat: bool = True) -> Mesh:
     """Truncated icosahedron in the unit sphere: 12 pentagons, 20 hexagons, 116 triangles.
 
