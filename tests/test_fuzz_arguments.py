@@ -177,7 +177,7 @@ def cases(folder):
         },
         "LSystem": {
             "initiator": "F", "rules": {"F": "F+F--F+F"}, "angle": 1.0, "start_angle": 0.0,
-            "alphabet": "F", "draw": "F", "dimensions": 2,
+            "alphabet": "F", "draw": "F", "drawn": None, "dimensions": 2,
         },
         "LSystem.draw": {"self": koch, "iterations": 2, "step": 1.0, "key": None},
         "LSystem.expand": {"self": koch, "iterations": 2, "key": None},

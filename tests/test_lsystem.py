@@ -1,5 +1,7 @@
 """L-systems: strings, and the turtle against one that walks symbol by symbol."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -188,3 +190,19 @@ def test_nothing_is_drawn_of_an_empty_string(initiator, rules, dimensions):
 def test_strings_that_are_too_long_are_refused():
     with pytest.raises(ValueError, match="iterations: wanted at most 268435456 symbols"):
         dr.LSystem(initiator="F", rules={"F": "F" * 32768}, angle=0.5).expand(3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_systems_may_be_changed_by_replace():
+    rules = {"F": [(0.5, "FG"), (0.5, "F+F")], "G": "GG"}
+    system = dr.LSystem(initiator="F", rules=rules, angle=0.5, alphabet="FG", draw="F")
+    same = dataclasses.replace(system)
+    assert jax.tree.structure(same) == jax.tree.structure(system)
+    turned = dataclasses.replace(system, angle=0.7, drawn="G")
+    assert (float(turned.angle), turned.drawn, turned.rules) == (np.float32(0.7), "G", system.rules)
+    with pytest.raises(ValueError, match="drawn: wanted None beside draw, got 'F'"):
+        dataclasses.replace(system, draw="G")
+    with pytest.raises(ValueError, match="drawn: wanted symbols of the alphabet 'FG'"):
+        dataclasses.replace(system, drawn="X")
+    with pytest.raises(ValueError, match="rules: wanted a dictionary of strings, got"):
+        dataclasses.replace(system, rules=(1, 2))

@@ -31,6 +31,7 @@ _TURNS = {"+": (2, 1), "-": (2, -1), "^": (1, -1), "&": (1, 1), "\\": (0, -1), "
 _SPECIAL = {2: "+-|[]", 3: "+-|[]^&\\/"}
 
 Rule = str | Sequence[tuple[float, str]]
+Rules = tuple[tuple[str, tuple[tuple[float, str], ...]], ...]
 
 
 class LineDrawing(NamedTuple):
@@ -88,7 +89,7 @@ class LSystem:
     angle: Float[Array, ""]
     start_angle: Float[Array, ""]
     initiator: str = static()
-    rules: tuple[tuple[str, tuple[tuple[float, str], ...]], ...] = static()
+    rules: Rules = static()
     alphabet: str = static()
     drawn: str = static()
     dimensions: int = static()
@@ -97,11 +98,12 @@ class LSystem:
         self,
         *,
         initiator: str,
-        rules: Mapping[str, Rule],
+        rules: Mapping[str, Rule] | Rules,
         angle: ArrayInput,
         start_angle: ArrayInput = 0.0,
         alphabet: str | None = None,
         draw: str | None = None,
+        drawn: str | None = None,
         dimensions: int = 2,
     ) -> None:
         """Make a system.
@@ -109,16 +111,23 @@ class LSystem:
         Args:
             initiator: the string to begin with.
             rules: for each symbol that changes its replacement, or a list of (probability,
-                replacement) of which each occurrence gets one by chance.
+                replacement) of which each occurrence gets one by chance; or another system's.
             angle: of a turn, in radians.
             start_angle: of the first direction, in radians.
             alphabet: the symbols that move; None: all that occur and do not turn.
             draw: those that draw; None: all of the alphabet.
+            drawn: the same by the attribute's name, as `dataclasses.replace` gives it.
             dimensions: 2 or 3.
         """
+        shown = "draw" if drawn is None else "drawn"
+        if drawn is not None and draw is not None:
+            raise ValueError(f"drawn: wanted None beside draw, got {drawn!r:.40}")
+        draw = draw if drawn is None else drawn
+        if isinstance(rules, tuple):
+            rules = _as_given(rules)
         if _check.positive_int("dimensions", dimensions) not in _SPECIAL:
             raise ValueError(f"dimensions: wanted 2 or 3, got {dimensions}")
-        for name, text in (("initiator", initiator), ("alphabet", alphabet), ("draw", draw)):
+        for name, text in (("initiator", initiator), ("alphabet", alphabet), (shown, draw)):
             if not (isinstance(text, str) or (text is None and name != "initiator")):
                 raise ValueError(f"{name}: wanted a string, got {type(text).__name__}")
         if not isinstance(rules, Mapping) or not all(isinstance(key, str) for key in rules):
@@ -130,7 +139,7 @@ class LSystem:
             occurring = {*"".join(strings), *rules} - set(special)
             alphabet = "".join(sorted(occurring))
         allowed = {*alphabet, *special}
-        for name, text in (("alphabet", alphabet), ("draw", draw or ""), ("rules", "".join(rules))):
+        for name, text in (("alphabet", alphabet), (shown, draw or ""), ("rules", "".join(rules))):
             wrong = [s for s in text if s not in alphabet or s in special or ord(s) > 255]
             if wrong:
                 raise ValueError(
@@ -267,6 +276,14 @@ def _choices(symbol: str, rule: Rule) -> tuple[tuple[float, str], ...]:
             f" {[chance for chance, _ in options]}"
         )
     return options
+
+
+def _as_given(rules: tuple[Any, ...]) -> Mapping[str, Rule]:
+    """Rules as a dictionary, of those that a system keeps."""
+    try:
+        return dict(rules)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"rules: wanted a dictionary of strings, got {rules!r:.40}") from error
 
 
 def _is_among(codes: np.ndarray, symbols: str) -> np.ndarray:
