@@ -36,6 +36,14 @@ def strongly_typed(value: Any) -> Array:
         return value if known else jnp.asarray(value, jnp.result_type(value))
 
 
+def own_copy(value: Array) -> Array:
+    """The same numbers in another buffer, so that both may be donated; traced ones as they are."""
+    if not is_concrete(value):
+        return value
+    with staying_known(value):
+        return jnp.array(value, copy=True)
+
+
 def staying_known(*values: Any) -> contextlib.AbstractContextManager[None]:
     """A context in which what is made of known numbers is known, inside of `jax.jit` too.
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, one_of, positive_int, real_number
+from diffrast._check import ArrayInput, float_array, one_of, own_copy, positive_int, real_number
 from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.linalg import normalize
 
@@ -242,9 +242,10 @@ def _set_colors(
     if ambient is not None:
         ambient = float_array("ambient", ambient, (3,))
     set_field(light, "ambient", ambient)
-    set_field(light, "diffuse", float_array("diffuse", diffuse, (3,)))
+    color = float_array("diffuse", diffuse, (3,))
+    set_field(light, "diffuse", color)
     if specular is None:
-        specular = diffuse
+        specular = own_copy(color)
     set_field(light, "specular", float_array("specular", specular, (3,)))
 
 

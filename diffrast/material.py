@@ -3,7 +3,7 @@
 from jax import Array
 from jaxtyping import Float
 
-from diffrast._check import ArrayInput, float_array, one_of
+from diffrast._check import ArrayInput, float_array, one_of, own_copy
 from diffrast._pytree import pytree_dataclass, set_field, static
 from diffrast.texture import AnyTexture, CubeTexture, Texture
 from diffrast.texture.kinds import texels
@@ -49,9 +49,10 @@ class Material:
         texture: AnyTexture | None = None,
         highlight: str = "phong",
     ) -> None:
-        set_field(self, "diffuse", float_array("diffuse", diffuse, (3,)))
+        color = float_array("diffuse", diffuse, (3,))
+        set_field(self, "diffuse", color)
         if ambient is None:
-            ambient = diffuse
+            ambient = own_copy(color)
         set_field(self, "ambient", float_array("ambient", ambient, (3,)))
         if specular is not None:
             specular = float_array("specular", specular, (3,))

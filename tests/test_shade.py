@@ -457,3 +457,16 @@ def test_precision_is_that_of_the_input():
 def test_errors_name_the_argument(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_colors_that_follow_others_may_be_donated_with_them():
+    smaller = jax.jit(lambda tree: jax.tree.map(lambda x: x / 2, tree), donate_argnums=0)
+    color = np.array([0.5, 0.25, 1.0], np.float32)
+    material = smaller(Material(diffuse=jnp.array(color)))
+    lights = [
+        DirectionalLight(direction=(0, 0, -1), diffuse=jnp.array(color)),
+        PointLight(position=(0, 0, 1), diffuse=jnp.array(color)),
+        SpotLight(position=(0, 0, 1), direction=(0, 0, -1), cutoff=1, diffuse=jnp.array(color)),
+    ]
+    for found in (material.ambient, *(light.specular for light in smaller(lights))):
+        np.testing.assert_array_equal(found, color / 2)
