@@ -40,7 +40,8 @@ def gaussian_blur(
             raise ValueError("radius: wanted an integer, as sigma is traced; got None")
         # What lies further away than the image is large is outside anyway.
         radius = math.ceil(min(4 * max(float(sigma), 0.0), max(image.shape[:2])))
-    offsets = np.arange(-positive_int("radius", radius, minimum=0), radius + 1)
+    radius = positive_int("radius", radius, minimum=0)
+    offsets = np.arange(-radius, radius + 1, dtype=sigma.dtype)
     kernel = jnp.exp(-0.5 * (offsets / jnp.maximum(sigma, 0.1)) ** 2).astype(image.dtype)
     return _convolve(_convolve(image, kernel, axis=0), kernel, axis=1)
 

@@ -123,7 +123,7 @@ def over_batches(
 
     def step(state: tuple[Array, T]) -> tuple[Array, T]:
         n, total = state
-        slots = n * at_once + jnp.arange(at_once)
+        slots = n * at_once + jnp.arange(at_once, dtype=jnp.int32)
         indices = stored(order[jnp.minimum(slots, order.shape[0] - 1)])
         return n + 1, add(indices, slots < count, total)
 

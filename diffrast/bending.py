@@ -90,14 +90,16 @@ def find_turning(
         color = _sums(hard)
         some = slice(_ROWS // 2, None, _ROWS)
         seen = face_image[some] >= 0
-        mean = jnp.sum(jnp.where(seen, abs(color[some]), 0)) / jnp.maximum(jnp.sum(seen), 1)
+        total = jnp.sum(jnp.where(seen, abs(color[some]), 0))
+        mean = total / jnp.maximum(jnp.sum(seen), 1).astype(total.dtype)
         bends = _bends(jnp.where(face_image >= 0, color, jnp.nan))
 
         def are_many(least: Array) -> Array:
             return 2 * jnp.sum(bends > least, dtype=jnp.int32) > _places(bends)
 
         least = lax.while_loop(are_many, lambda least: 2 * least, _least(mean))
-        much = jnp.where(bends > jnp.maximum(least, _SHARP * _least(mean)), 2, bends > least)
+        sharply = bends > jnp.maximum(least, _SHARP * _least(mean))
+        much = jnp.where(sharply, 2, (bends > least).astype(int))
         return mean, stored(much.astype(jnp.int8))  # else the numbers would be held
 
     seen = lax.stop_gradient((face_image, hard))
@@ -190,7 +192,7 @@ def _largest(values: Array, least: Array, kind: Int[Array, "height width"]) -> C
     room = jnp.zeros(places + _BLOCK * some, jnp.int32) + zero
     start = least, ([room] * 3, [zero + places + 1, zero, zero])
     _, (lists, sizes) = lax.while_loop(lambda state: ~are_few(state[1]), look, start)
-    place = jnp.arange(places)
+    place = jnp.arange(places, dtype=jnp.int32)
     plain, sharp, others = sizes
     moving = plain + sharp
     number = jnp.where(place < plain, lists[0][place], lists[1][jnp.maximum(place - plain, 0)])

@@ -79,7 +79,7 @@ def clip_triangles(
     count = jnp.full(faces.shape[0], 3, jnp.int32)
     for plane in planes:
         corners, count = _cut(corners, count, plane)
-    exists = jnp.arange(corners.shape[1]) < count[:, None]
+    exists = jnp.arange(corners.shape[1], dtype=jnp.int32) < count[:, None]
     corners = jnp.where(exists[..., None], corners, 0)
     return ClippedPolygons(corners[..., :4], corners[..., 4:], count)
 
@@ -93,7 +93,7 @@ def _side(points: Array, plane: Array) -> Array:
 def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     """Polygons (F, n, values), of which `count` corners are used, with one more corner."""
     size = corners.shape[1]
-    slot = jnp.arange(size)
+    slot = jnp.arange(size, dtype=jnp.int32)
     used = slot < count[:, None]
     following = jnp.where(slot + 1 < count[:, None], slot + 1, 0)
     after = jnp.take_along_axis(corners, following[..., None], axis=1)
@@ -108,14 +108,14 @@ def _cut(corners: Array, count: Array, plane: Array) -> tuple[Array, Array]:
     crossing = inner + share[..., None] * (outer - inner)
     kept = used & here_in
     # Each corner that stays, then the crossing behind it, in the polygon's order.
-    amount = kept.astype(jnp.int32) + crosses
+    amount = kept.astype(jnp.int32) + crosses.astype(jnp.int32)
     place = jnp.cumsum(amount, axis=1) - amount
     face = jnp.arange(corners.shape[0])[:, None]
     result = jnp.zeros((corners.shape[0], size + 1, corners.shape[2]), corners.dtype)
     result = result.at[face, jnp.where(kept, place, size + 1)].set(corners, mode="drop")
-    behind = jnp.where(crosses, place + kept, size + 1)
+    behind = jnp.where(crosses, place + kept.astype(jnp.int32), size + 1)
     result = result.at[face, behind].set(crossing, mode="drop")
-    total = jnp.sum(amount, axis=1)
+    total = jnp.sum(amount, axis=1, dtype=jnp.int32)
     return result, jnp.where(total >= 3, total, 0)  # fewer have no area
 
 

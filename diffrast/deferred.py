@@ -124,7 +124,8 @@ def _in_one_go(shade: Shade, inputs: _Inputs) -> Columns:
 
 
 def _background_alone(inputs: _Inputs) -> Columns:
-    return _before_background([varying_zero(inputs)] * 3, inputs)
+    zero = varying_zero(inputs).astype(inputs.background[0].dtype)
+    return _before_background([zero] * 3, inputs)
 
 
 def _before_background(colors: Columns, inputs: _Inputs) -> Columns:

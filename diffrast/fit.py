@@ -171,9 +171,10 @@ def _gradient_step(
         return value
 
     value, gradient = jax.value_and_grad(value_of)(params)
-    updates, state = optax.with_extra_args_support(optimizer).update(
-        gradient, state, params, value=value, grad=gradient, value_fn=value_of
-    )
+    with jax.numpy_dtype_promotion("standard"):  # optax counts steps, and divides the count
+        updates, state = optax.with_extra_args_support(optimizer).update(
+            gradient, state, params, value=value, grad=gradient, value_fn=value_of
+        )
     gradient_norm = linalg.norm(ravel_pytree(gradient)[0])
     searched = jnp.asarray(optax.tree_utils.tree_get(state, "num_linesearch_steps", 0))
     return optax.apply_updates(params, updates), state, value, gradient_norm, searched

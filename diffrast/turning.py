@@ -117,7 +117,7 @@ def turns(
 
 def _put(image: Array, chosen: Chosen, added: Array, *, border: int = 0) -> Array:
     """Add to the chosen pixels, in an image with such a border."""
-    place = jnp.arange(chosen.number.size)
+    place = jnp.arange(chosen.number.size, dtype=jnp.int32)
     row, column = divided(chosen.number, image.shape[1] - 2 * border)
     row = jnp.where(place < chosen.total, row + border, image.shape[0] + place)  # none twice
     return image.at[row, column + border].add(added, mode="drop", unique_indices=True)
@@ -155,7 +155,8 @@ def _added(
             weight = jnp.where(parts.points > 0, quarter * quarter, quarter)
             return total.at[parts.place].add(stored(_sums(colors, points, parts, n, weight)))
 
-        start = _nothing(colored, points) + varying_zero((colored, points))
+        start = _nothing(colored, points)
+        start = start + varying_zero((colored, points)).astype(start.dtype)
         return over_parts(points.chosen, count, step, start)
 
     return over_views(all_batches, size[0] * size[1])(*varying_alike((colored, points)))
@@ -250,7 +251,7 @@ def _colors(
     full = size[0] + 2, size[1] + 2
     pixels = pixels_at(face, row + 1, column + 1, full, drawn.positions_clip.dtype)
     moved = POINTS + np.array(shift, np.float32)[:, None, None]
-    right, down = jnp.asarray(moved)[:, :, parts.points]
+    right, down = jnp.asarray(moved, pixels.x.dtype)[:, :, parts.points]
     x, y = pixels.x + 2 * right, pixels.y - 2 * down
     flat, x, y = stored_together([part.reshape(-1) for part in (face, x, y)])
     # Stored, and the colours: in what repeats rows no loop is vectorised.

@@ -118,7 +118,8 @@ def faces_at(
             beside = stored(face_image[row + 1 + down, column + 1 + right])
             parted = exists & (place >= chosen.plain)
             beside = stored(jnp.where(parted & (beside != own), beside, -1))
-            seen = _unhidden(seen, beside, point, (x0 + right, y0 + down), surface)
+            its_centre = x0 + right.astype(x0.dtype), y0 + down.astype(y0.dtype)
+            seen = _unhidden(seen, beside, point, its_centre, surface)
             return lax.dynamic_update_slice_in_dim(found, seen, n * place.size, 1)
 
         return over_parts(chosen, count, add, found)

@@ -196,3 +196,57 @@ def test_shard_map_of_grad_by_the_vertices_of_one_object():
     mapped = jax.jit(jax.vmap(jax.grad(loss)))(EYES[:2] / 4)
     np.testing.assert_allclose(gradients, mapped, rtol=1e-4, atol=1e-6)
     assert np.all(np.any(gradients != 0, axis=1))
+
+
+def of_two_cubes_with_shadows():
+    """That pierce each other."""
+    slab = dr.Object(dr.shapes.cube(), None, dr.linalg.scaling((2, 0.4, 2)))
+    shadow = dr.Shadow(resolution=16)
+    sun = dr.DirectionalLight(direction=(1, -2, -1), shadow=shadow)
+    lamp = dr.PointLight(position=(2, 2, 3), shadow=shadow)
+    return [dr.Object(dr.shapes.cube()), slab], [sun, lamp], {}
+
+
+def of_textures():
+    texture = dr.Texture(np.ones((4, 4, 3)), filter="trilinear", anisotropy=2)
+    shiny = dr.Material(texture=texture, specular=(0.5, 0.5, 0.5))
+    ball = dr.Object(dr.shapes.uv_sphere(segments=6, rings=4), shiny)
+    spot = dr.SpotLight(position=(2, 3, 2), direction=(-2, -3, -2), cutoff=0.5)
+    return [ball], [spot], {"samples": 4}
+
+
+def of_lit_vertices():
+    lights = [dr.AmbientLight(color=(1, 1, 1)), dr.DirectionalLight(direction=(1, -2, -1))]
+    return [dr.Object(dr.shapes.cube())], lights, {"shading": "gouraud", "antialias": False}
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("scene", [of_two_cubes_with_shadows, of_textures, of_lit_vertices])
+def test_gradients_without_implicit_conversions(scene, double):
+    """Traced alone: that is when JAX refuses them."""
+    with jax.enable_x64(double), jax.numpy_dtype_promotion("strict"):
+        objects, lights, options = scene()
+
+        def loss(eye):
+            scene = dr.Scene(objects=objects, lights=lights)
+            return jnp.mean(dr.render(scene, camera(eye), dr.RenderSettings(**SIZE, **options)))
+
+        slope = jax.eval_shape(jax.grad(loss), jnp.array([3.0, 2.0, 4.0]))
+    assert slope.dtype == (jnp.float64 if double else jnp.float32)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_the_rest_without_implicit_conversions(double):
+    def drawn(eye):
+        mesh, lamp = dr.shapes.icosphere(1), dr.PointLight(position=(2, 2, 3))
+        scene = dr.Scene(objects=[dr.Object(mesh)], lights=[lamp])
+        drawings = (dr.wireframe(scene, camera(eye), **SIZE, antialias=k) for k in (False, True))
+        buffers = dr.render_buffers(scene, camera(eye), dr.RenderSettings(**SIZE))
+        table = dr.LookUpTable(positions=(0, 1), colors=((0, 0, 0), (1, 1, 1)))
+        cosines = dr.recolor(dr.light_cosines(buffers, lamp), buffers.face, table)
+        clipped = dr.clip.clip_triangles(dr.world_to_clip(camera(eye), mesh.vertices), mesh.faces)
+        return dr.fit.gaussian_blur(sum(drawings, cosines), 1.5).sum() + clipped.corners.sum()
+
+    with jax.enable_x64(double), jax.numpy_dtype_promotion("strict"):
+        slope = jax.eval_shape(jax.grad(drawn), jnp.array([3.0, 2.0, 4.0]))
+    assert slope.dtype == (jnp.float64 if double else jnp.float32)

@@ -105,13 +105,13 @@ def nothing(view: View, method: Method, start: Start | None, zero: Array) -> Ble
     """No pieces yet; `zero` is a number that varies with the view as what is added does."""
     channels, dtype = view.image.shape[2], view.image.dtype
     records = left = None
-    own = cropped(view.image, view.image.shape) + zero
+    own = cropped(view.image, view.image.shape) + zero.astype(dtype)
     if method.capacity:
         records = no_records(method.capacity, channels, dtype, start, zero)
         left = jnp.zeros(own.shape[0], jnp.int16) + zero.astype(jnp.int16)
     if start is not None:
         return Blended(records, None)
-    return Blended(records, Sums(jnp.zeros_like(own) + zero, (own, own), left))
+    return Blended(records, Sums(jnp.zeros_like(own) + zero.astype(dtype), (own, own), left))
 
 
 def _place(view: View, pixel: Array, look: Array | int) -> Array:

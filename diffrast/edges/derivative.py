@@ -40,7 +40,7 @@ def _over_rows(
         first = begin = n * some
         if capacity % some:  # the last block begins among the rows of the one before
             begin = jnp.minimum(first, capacity - some)
-        number = begin + jnp.arange(some)
+        number = begin + jnp.arange(some, dtype=jnp.int32)
         used = number < count if begin is first else (number >= first) & (number < count)
         rows = [lax.dynamic_slice_in_dim(column, begin, some) for column in records.columns]
         return add(used, rows, total)
@@ -70,7 +70,7 @@ def _over_pieces(
         following = jax.tree.map(
             lambda again, next: jnp.where(ended, again, next), records.following, found.following
         )
-        return which + ended, following, total
+        return which + ended.astype(which.dtype), following, total
 
     def is_left(state: tuple[Array, Start, Any]) -> Array:
         return state[0] < len(adds)

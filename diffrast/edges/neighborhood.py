@@ -39,7 +39,7 @@ def picked(values: Array, index: Array) -> Array:
 
 def first_row(mask: Bool[Array, "rows *n"]) -> Int[Array, "*n"]:
     """The first row of each column that is true, or as many as there are."""
-    rows = jnp.arange(mask.shape[0]).reshape(-1, *[1] * (mask.ndim - 1))
+    rows = jnp.arange(mask.shape[0], dtype=jnp.int32).reshape(-1, *[1] * (mask.ndim - 1))
     return jnp.min(jnp.where(mask, rows, rows.size), axis=0)
 
 
@@ -65,7 +65,7 @@ def steps_to(look: Int[Array, "*n"]) -> Int[Array, "2 *n"]:
 
 def pixels_round(image: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:
     """The values of the 3×3 pixels round each pixel of an image with a border, shape (9, n)."""
-    down, right = np.indices((3, 3)).reshape(2, 9, 1)
+    down, right = np.indices((3, 3), np.int32).reshape(2, 9, 1)
     return image[row + down, column + right]
 
 

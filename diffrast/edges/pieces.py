@@ -290,7 +290,7 @@ def cut(
     width: int,
 ) -> Pieces:
     """Pieces first_piece, first_piece + 1, ... of all segments; `ends` sums their `places`."""
-    number = first_piece + jnp.arange(at_once)
+    number = first_piece + jnp.arange(at_once, dtype=jnp.int32)
     # As many segments end before or at each piece's number. Those at the very end do not count:
     # they may be many, and a GPU would take them one after another.
     end = jnp.where(ends < ends[-1], jnp.maximum(ends - first_piece, 0), at_once)
@@ -308,9 +308,9 @@ def cut(
     # What runs along a border between two pixels belongs to one of them.
     first, length = stored((jnp.where(length > 0, first, 0.5), length))
     total = length[0] + length[1]
-    middle = (k + 1 - first[0] - first[1]) / jnp.where(total > 0, total, 1)
+    middle = ((k + 1).astype(first.dtype) - first[0] - first[1]) / jnp.where(total > 0, total, 1)
     cell = stored(jnp.floor(first + jnp.clip(middle, 0, 1) * length))
-    exists = exists & (total > 0) & (cell[0] + cell[1] == k)
+    exists = exists & (total > 0) & (cell[0] + cell[1] == k.astype(cell.dtype))
 
     moves = length > 0
     inverse = 1 / jnp.where(moves, length, 1)
@@ -322,7 +322,7 @@ def cut(
     turned = at[1] < at[0]
     column_row = jnp.floor(jnp.where(turned, -at[0], at[0])) + cell
     pixel = jnp.where(turned, -column_row - 1, column_row).astype(jnp.int32)
-    size = jnp.array([width, height])[:, None]
+    size = jnp.array([width, height], jnp.int32)[:, None]
     inside = jnp.all((pixel >= 0) & (pixel < size), axis=0)
     pixel, range_ = stored_together((pixel, range_))
     return Pieces(segment, pixel, range_, exists & inside & (range_[0] < range_[1]))

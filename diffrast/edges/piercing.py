@@ -104,7 +104,7 @@ def choose_pixels(
     Also of those that hold a face which is seen at no centre, `unseen`; -1 where there is none.
     """
     # Else all bodies would be looked up, and held, before there is anything unseen.
-    first, last = bodies_round(face_image, bodies + zero_after(unseen[0]))
+    first, last = bodies_round(face_image, bodies + zero_after(unseen[0]).astype(bodies.dtype))
     return selected((first + last > bodies.size + 1) | (unseen >= 0).reshape(first.shape))
 
 
@@ -242,7 +242,9 @@ def _meeting(
         n, pair, searched, arrived, met, point = state
         point = jnp.clip(point, -0.5, 0.5)
         # Half-way where it is too far: the surface may turn away before.
-        to = jnp.where(arrived, point[:, None], (point[:, None] + from_centre) / 2)
+        to = jnp.where(
+            arrived, point[:, None], (point[:, None] + from_centre.astype(point.dtype)) / 2
+        )
         x, y = stored(centre + to)
         ways = jnp.where(searched, pair, -1)
         reached, there = walk(ways, x, y, surface)
@@ -362,7 +364,7 @@ def lines_of(
     used = used & ~_hidden(planes, ~own, x, y, depth[0])
 
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
-    in_front = values + aside * jnp.array([[1], [-1]])
+    in_front = values + aside * jnp.array([[1], [-1]], aside.dtype)
     in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
     total = _added(in_front)
 
@@ -371,7 +373,7 @@ def lines_of(
         [sums[1], sums[2], depth - (x + centre[0]) * sums[1] - (y + centre[1]) * sums[2]]
     )
     # λ is in units of 1/w, and so are the planes and the slope that divides them.
-    factor = (last - first) * inverse / crossings.unit[place] * jnp.array([[-1], [1]])
+    factor = (last - first) * inverse / crossings.unit[place] * jnp.array([[-1], [1]], depth.dtype)
     motion = values[:, None] * (factor * plane)[None]
     face = both(planes.face)
     return Line(
@@ -395,7 +397,7 @@ def _where_shown(
     """
     seen = seen[_CENTRE : _CENTRE + 9]
     patch = stored(jnp.where(seen >= 0, patches[jnp.maximum(seen, 0)], -1))
-    across, down = steps_to(jnp.asarray(_NEAREST_FIRST))[..., None]
+    across, down = steps_to(jnp.asarray(_NEAREST_FIRST))[..., None].astype(x.dtype)
     distance = ((x - across) ** 2 + (y - down) ** 2).at[0].set(-1)
     best = least_row(patch[:, None] == patches[face], distance[:, None])
     return jnp.where(best < 9, jnp.asarray(_NEAREST_FIRST)[jnp.minimum(best, 8)], look)

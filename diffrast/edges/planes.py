@@ -31,8 +31,11 @@ def cross_rows(a: Array, b: Array) -> Array:
 
 
 def dot_rows(a: Array, b: Array) -> Array:
-    """Dot products, row by row: a reduction of so few would be a call into a library."""
-    return reduce(add, [x * y for x, y in zip(a, b, strict=True)])
+    """Dot products, row by row: a reduction of so few would be a call into a library.
+
+    Those of `b` may be integers: steps between pixels.
+    """
+    return reduce(add, [x * y.astype(x.dtype) for x, y in zip(a, b, strict=True)])
 
 
 def largest(vectors: Array) -> Array:

@@ -51,9 +51,9 @@ def no_records(
         start.batch,
         start._replace(row=start.row + capacity),
         jnp.zeros((capacity, 6), jnp.int32) + zero,
-        jnp.zeros((capacity, channels), dtype) + zero,
-        jnp.zeros((capacity, 2), dtype) + zero,
-        jnp.zeros((capacity, 6), dtype) + zero,
+        jnp.zeros((capacity, channels), dtype) + zero.astype(dtype),
+        jnp.zeros((capacity, 2), dtype) + zero.astype(dtype),
+        jnp.zeros((capacity, 6), dtype) + zero.astype(dtype),
     )
 
 
@@ -64,7 +64,7 @@ def has_room(records: Records) -> Bool[Array, ""]:
 
 def after_batch(records: Records, exists: Bool[Array, ""]) -> Records:
     """The same after a batch, if it exists: in the first that is not recorded the next begin."""
-    batch = records.batch + exists
+    batch = records.batch + exists.astype(records.batch.dtype)
     fits = exists & has_room(records)
     following = Start(
         records.following.row,
@@ -110,7 +110,7 @@ def with_lines(
         (
             jnp.stack([pixel, places[1], places[0], places[0], *vertices[i]], axis=-1),
             jump,
-            jnp.stack([area * (i == 0), jnp.zeros_like(area)], axis=-1),
+            jnp.stack([area * float(i == 0), jnp.zeros_like(area)], axis=-1),
             stored(motion[i].T),
         )
         for i in range(len(used))

@@ -87,7 +87,7 @@ def look_inwards(
     """
     faces, pixels, topology, volume = surface
     depth, inner = inwards
-    step = steps_to(inner)
+    step = steps_to(inner).astype(centre.dtype)
     next_face = stored(picked(pictured, inner))
     first = jnp.minimum(thickness, depth)
     beyond = jnp.where(thickness >= depth, front, next_face)

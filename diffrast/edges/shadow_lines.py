@@ -172,7 +172,7 @@ def cross_shadows(
 
     # The faces round the pixel and beside its own, and those of its surface that are turned to the
     # light.
-    column, row = pixel[:, None] + 1 + steps_to(jnp.arange(9))[..., None]
+    column, row = pixel[:, None] + 1 + steps_to(jnp.arange(9, dtype=jnp.int32))[..., None]
     shown = stored(pixels_round(face_image, *pixel))
     seen = jnp.maximum(shown, 0)
     own, patch = shown[4], stored(cast.patches[seen])
@@ -236,7 +236,7 @@ def cross_shadows(
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
     meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
     linked = meets[0] | meets[1]
-    primary = valid & (jnp.arange(_EDGES)[:, None] == first_row(valid))
+    primary = valid & (jnp.arange(_EDGES, dtype=jnp.int32)[:, None] == first_row(valid))
     chain = primary
     for _ in range(2):
         chain = chain | jnp.any(linked & chain, axis=1)
@@ -251,7 +251,10 @@ def cross_shadows(
     both = jnp.all(told | ~valid, axis=1)
     either = jnp.any(told & valid, axis=1)
     certain = jnp.where((jnp.arange(9)[:, None] == 4) & is_own[0], _CERTAIN, 1)
-    wrong = [jnp.sum(((one != lit) & counts) * certain, axis=0) for one in (both, either)]
+    wrong = [
+        jnp.sum(((one != lit) & counts).astype(certain.dtype) * certain, axis=0)
+        for one in (both, either)
+    ]
     decided = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
     chosen = jnp.where(decided, valid, chosen)
     ends_others = decided & valid[:, None] & valid & (chain[:, None] != chain)

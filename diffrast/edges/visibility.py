@@ -134,7 +134,7 @@ def look(
     front_on_right = jnp.where(use_first | fold, first_on_right, ~first_on_right)
     outward = jnp.where(front_on_right, -1, 1)
     front, other, outward = stored_together((front, other, outward))
-    out = stored(outward * normal)
+    out = stored(outward.astype(normal.dtype) * normal)
 
     t = (pieces.range[0] + pieces.range[1]) / 2
     apex = stored(faces[jnp.maximum(front, 0), third_corner(front_corners)])
@@ -227,13 +227,14 @@ def look(
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
     close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
     least = jnp.array(_TIE[1], near.dtype)
+    told = (outward * is_beyond).astype(near.dtype)  # the sign of `to_right`
     # Of an edge that ends before the centre the one beyond its corner tells.
     ends_before = (at_end[0] & (dot_rows(begin, along) > 0)) | (
         at_end[1] & (dot_rows(end, along) < 0)
     )
-    turned = close & ~ends_before & (outward * is_beyond * to_right < least)
-    shift = stored(jnp.where(turned, outward * is_beyond * least - to_right, 0))
-    centre_depth = -outward * (to_right + shift)
+    turned = close & ~ends_before & (told * to_right < least)
+    shift = stored(jnp.where(turned, told * least - to_right, 0))
+    centre_depth = (-outward).astype(near.dtype) * (to_right + shift)
     wrong_side = wrong_side & close
     begin, end, centre_depth = stored_together(
         (begin - shift * normal, end - shift * normal, centre_depth)

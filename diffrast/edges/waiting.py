@@ -57,8 +57,8 @@ def first_ones(waiting: Waiting, at_once: AtOnce) -> Pieces:
     segment, pixel, range_, _ = stored(tuple(column[..., piece] for column in waiting.pieces))
     begin, end = range_
     length = (end - begin) / parts
-    last = jnp.where(part == parts - 1, end, begin + (part + 1) * length)
-    range_ = stored(jnp.stack([begin + part * length, last]))
+    last = jnp.where(part == parts - 1, end, begin + (part + 1).astype(length.dtype) * length)
+    range_ = stored(jnp.stack([begin + part.astype(length.dtype) * length, last]))
     return Pieces(segment, pixel, range_, piece < waiting.total)
 
 

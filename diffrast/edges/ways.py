@@ -137,7 +137,7 @@ def inwards(
     ours = stored(jnp.stack([picked(spot.pictured, look) for look in looks]))
     alike = jnp.stack([picked(spot.patch, look) for look in looks]) == spot.front_patch
     alike = alike & spot.fold & (ours >= 0)
-    x, y = spot.centre[:, None] + steps_to(looks)
+    x, y = spot.centre[:, None] + steps_to(looks).astype(spot.centre.dtype)
     both = jnp.stack([ours, jnp.broadcast_to(spot.front, ours.shape)])
     values, inverse_depths = edge_values(corners_of(both, surface.faces, surface.pixels), x, y)
     ahead = inverse_depths[0] - spot.near
@@ -205,7 +205,7 @@ def sides_of(faces: Int[Array, "2 n"], found: Walked, surface: Surface) -> Colum
 
 def _seen_nearest(mask: Array, pictured: Array, point: Array) -> Array:
     """What the pixel of the 3×3 shows whose centre is nearest to a point, of a mask; or -1."""
-    x, y = steps_to(jnp.arange(9))[..., None] - point[:, None]
+    x, y = steps_to(jnp.arange(9))[..., None].astype(point.dtype) - point[:, None]
     return _seen_least(mask, pictured, x * x + y * y)
 
 

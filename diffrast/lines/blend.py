@@ -251,7 +251,9 @@ def _pixels(frame: Frame, band: Band, number: Array) -> tuple[Array, Array]:
     """Rows and columns (steps, across) of steps."""
     along = (band.first + number)[:, None]
     half = frame.line_width / math.sqrt(2) + 0.5 + _SLACK
-    across = _passed(frame, band, number, -half)[:, None] + jnp.arange(frame.across)
+    across = _passed(frame, band, number, -half)[:, None] + jnp.arange(
+        frame.across, dtype=jnp.int32
+    )
     along, steep = jnp.broadcast_to(along, across.shape), band.steep[:, None]
     return jnp.where(steep, along, across), jnp.where(steep, across, along)
 

@@ -227,8 +227,9 @@ def _fragments(
     covered, at = line >= 0, jnp.maximum(line, 0)
     change = jnp.abs(segments.end - segments.start)[at]
     steep = change[..., 1] > change[..., 0]
-    x_pixel = jnp.arange(width) + (1 - width) / 2
-    y_pixel = ((height - 1) / 2 - jnp.arange(height))[:, None]
+    dtype = positions_clip.dtype
+    x_pixel = jnp.arange(width).astype(dtype) + (1 - width) / 2
+    y_pixel = ((height - 1) / 2 - jnp.arange(height).astype(dtype))[:, None]
     ends, depths = [], []
     for k in range(2):
         point = positions_clip[lines[at, k]]
@@ -303,7 +304,9 @@ def _filled_up(points: Array, lines: Array) -> tuple[Array, Array, Array]:
 def _segments(points: Array, lines: Array, used: Array, height: int, width: int) -> Segments:
     make = segments_from_pixels if points.shape[1] == 2 else segments_from_clip
     segments = make(points, lines, height=height, width=width)
-    return segments._replace(seen=segments.seen & (jnp.arange(lines.shape[0]) < used))
+    return segments._replace(
+        seen=segments.seen & (jnp.arange(lines.shape[0], dtype=jnp.int32) < used)
+    )
 
 
 @partial(jax.jit, static_argnames=("style",))

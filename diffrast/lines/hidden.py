@@ -52,8 +52,9 @@ def surface_of(
     unit = jnp.where(unit > 0, unit, 1)
     rank, positions_clip = depth_rank(positions_clip) / unit, positions_clip / unit
     corners = corners_at(faces, fragments.face)
-    x_pixel = jnp.arange(width) + (1 - width) / 2
-    y_pixel = ((height - 1) / 2 - jnp.arange(height))[:, None]
+    dtype = positions_clip.dtype
+    x_pixel = jnp.arange(width).astype(dtype) + (1 - width) / 2
+    y_pixel = ((height - 1) / 2 - jnp.arange(height).astype(dtype))[:, None]
     ranks, weights, x, y = [], [], [], []
     for corner in corners:
         w = positions_clip[corner, 3]

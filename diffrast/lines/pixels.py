@@ -71,7 +71,7 @@ def plan(segments: Segments, *, height: int, width: int) -> Course:
     """Snap lines to the grid and find out how they run."""
     bits = subpixel_bits(height, width)
     # Measured from a pixel border near the image's middle, where float32 is finest.
-    middle = np.array([width // 2, height // 2])
+    middle = np.array([width // 2, height // 2], np.int32)
     grid = [
         jnp.round((p - middle.astype(p.dtype)) * (1 << bits)).astype(jnp.int32)
         for p in lax.stop_gradient((segments.start, segments.end))
@@ -135,7 +135,7 @@ def step_at(course: Course, line: Array, number: Array, bits: int) -> Step:
     # does not.
     exact = run * at.drift - (border * size - at.within) * at.length
     beyond = jnp.where(jnp.abs(rest) < _SURE, exact > 0, rest > 0)
-    pixels = jnp.clip(border - 1 + beyond, 0, at.most)
+    pixels = jnp.clip(border - 1 + beyond.astype(jnp.int32), 0, at.most)
     along, across = at.pixel + at.forward * number, at.across + at.aside * pixels
     row, column = jnp.where(at.steep, along, across), jnp.where(at.steep, across, along)
     beyond = jnp.abs(centre - run).astype(dtype) / size
@@ -158,12 +158,12 @@ def number_steps(count: Array) -> Numbering:
 def lines_of_steps(numbering: Numbering, chunk: Array, size: int) -> tuple[Array, Array, Array]:
     """Line and step within it of a chunk of steps, and whether there is such a step."""
     begin = chunk * size
-    begins_before = jnp.sum(numbering.first <= begin)
+    begins_before = jnp.sum(numbering.first <= begin, dtype=jnp.int32)
     later = (numbering.first > begin) & (numbering.first < begin + size)
     place = jnp.where(later, numbering.first - begin, size)
     marks = jnp.zeros(size, jnp.int32).at[place].add(1, mode="drop")
     line = begins_before - 1 + jnp.cumsum(marks)
-    step = begin + jnp.arange(size)
+    step = begin + jnp.arange(size, dtype=jnp.int32)
     return line, step - numbering.first[line], step < numbering.total
 
 

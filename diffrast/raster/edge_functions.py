@@ -10,7 +10,7 @@ to one owner. Where int32 might overflow, float32 knows the sign and the value s
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.typing import ArrayLike
 
 from diffrast._compensated import difference_of_products
@@ -244,7 +244,7 @@ def _homogeneous_edge(start: Vertices, end: Vertices, sign: Array, image: Image)
         sign,
         image,
     )
-    constant = jnp.where(line[2] * sign > 0, _SATURATED, -_SATURATED)
+    constant = jnp.where(line[2] * sign.astype(unit.dtype) > 0, _SATURATED, -_SATURATED)
     return edge._replace(k=jnp.where(one | both | crosses, edge.k, constant))
 
 
@@ -290,7 +290,9 @@ def evaluate(plane: Plane, column: Array, row: Array, columns: ArrayLike, rows: 
     """Value at each pixel of the block that begins at (column, row)."""
     dtype = plane.value.dtype
     x, y = column.astype(dtype) - plane.x, row.astype(dtype) - plane.y
-    return (plane.value + plane.dx * x + plane.dy * y) + plane.dx * columns + plane.dy * rows
+    value = plane.value + plane.dx * x + plane.dy * y
+    value = value + plane.dx * lax.convert_element_type(columns, dtype)
+    return value + plane.dy * lax.convert_element_type(rows, dtype)
 
 
 def each_edge(edges: Edge) -> list[Edge]:

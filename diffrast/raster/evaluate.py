@@ -142,7 +142,8 @@ def evaluate(drawn: Drawn, pixels: Pixels, carried: Carried | None = None) -> Ev
 @jax.custom_jvp
 def carry(drawn: Drawn, pixels: Pixels) -> Carried:
     """The changes of `Carried`."""
-    zeros = jnp.zeros(pixels.face.shape, drawn.positions_clip.dtype) + varying_zero((drawn, pixels))
+    dtype = drawn.positions_clip.dtype
+    zeros = jnp.zeros(pixels.face.shape, dtype) + varying_zero((drawn, pixels)).astype(dtype)
     clip = [] if drawn.projection else [zeros] * 3
     return Carried(clip, tuple([zeros] * a.shape[1] for a in drawn.attributes))
 
@@ -163,10 +164,10 @@ def _carry_derivative(primals: Any, tangents: Any) -> tuple[Carried, Carried]:
     def change_of(column: Array) -> Array:
         if face.size < faces.shape[0]:
             at = [jnp.where(face >= 0, column[corner], 0) for corner in corners_at(faces, face)]
-            return blend(barycentrics, at) + zero
+            return blend(barycentrics, at) + zero.astype(column.dtype)
         corners = [stored(column[faces[:, j]], witness) for j in range(3)]
         at = [corner.at[visible].get(mode="fill", fill_value=0) for corner in corners]
-        return blend(barycentrics, at) + zero
+        return blend(barycentrics, at) + zero.astype(column.dtype)
 
     def changes(values: Any, zeros: Columns, columns: tuple[int, ...] | range) -> Any:
         if isinstance(values, SymbolicZero):

@@ -170,10 +170,12 @@ def group_by_class(classes: Int[Array, " F"]) -> tuple[Int[Array, " F"], Int[Arr
     # The start is made from the data so that, under `shard_map`, it varies like them.
     totals, before = lax.scan(add, one[:, 0] & 0, one.T)
     mask = (1 << field) - 1
-    totals = (totals[None, :] >> (field * jnp.arange(CULLED)[:, None])) & mask
+    totals = (totals[None, :] >> (field * jnp.arange(CULLED, dtype=jnp.int32)[:, None])) & mask
     ends = jnp.cumsum(totals.reshape(-1)).reshape(CULLED, runs)
     starts = ends - totals
-    start_of_run = starts.reshape(-1)[shift // field * runs + jnp.arange(runs)[:, None]]
+    start_of_run = starts.reshape(-1)[
+        shift // field * runs + jnp.arange(runs, dtype=jnp.int32)[:, None]
+    ]
     rank = (before.T >> shift) & mask
     slot = jnp.where(drawn, start_of_run + rank, runs * run).reshape(-1)[:count]
     order = jnp.zeros(count, jnp.int32)

@@ -189,7 +189,9 @@ def _draw_blocks(
         dx, dy = triangle_slopes(x, y, values)
         x_offset = column.astype(x[0].dtype) + (1 - image.width) / 2 - x[0]
         y_offset = row.astype(x[0].dtype) + (1 - image.height) / 2 - y[0]
-        key = (values[0] + dx * x_offset + dy * y_offset) + dx * columns + dy * rows
+        key = values[0] + dx * x_offset + dy * y_offset
+        key = key + dx * lax.convert_element_type(columns, dx.dtype)
+        key = key + dy * lax.convert_element_type(rows, dy.dtype)
         key = jnp.clip(key, minimum3(values), maximum3(values))
         return _resolve(buffer, (row, column), outside >= 0, key, face)
 
@@ -218,7 +220,7 @@ def _draw_sweeps(
     first, stop = span
 
     def draw_chunk(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        slots = first + n * CHUNK + jnp.arange(CHUNK)
+        slots = first + n * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32)
         chunk = order[jnp.minimum(slots, order.shape[0] - 1)]
         sweeps = stored_together(set_up(corners_of(vertices, faces, chunk), image, cull_backfaces))
         walk = _plan_walk(sweeps, slots < stop, image)
@@ -318,7 +320,7 @@ def _plan_walk(sweeps: Sweep, drawn: Array, image: Image) -> _Walk:
     """Which tiles of each row of tiles the edges may leave inside."""
     dtype = sweeps.edges.anchor_x.dtype
     tile_rows, tile_columns = _tile_counts(image)
-    row = jnp.arange(tile_rows) * TILE[0]
+    row = jnp.arange(tile_rows, dtype=jnp.int32) * TILE[0]
     first = sweeps.columns[0].astype(dtype)[:, None]
     last = sweeps.columns[1].astype(dtype)[:, None]
     left, right = first, last
@@ -333,7 +335,7 @@ def _plan_walk(sweeps: Sweep, drawn: Array, image: Image) -> _Walk:
     used = used & (row + TILE[0] > sweeps.rows[0][:, None]) & (row <= sweeps.rows[1][:, None])
     left = jnp.floor(jnp.clip(left, first, last)).astype(jnp.int32) // TILE[1]
     right = jnp.ceil(jnp.clip(right, first, last)).astype(jnp.int32) // TILE[1]
-    start = jnp.arange(CHUNK * tile_rows) * tile_columns
+    start = jnp.arange(CHUNK * tile_rows, dtype=jnp.int32) * tile_columns
     first_tile = jnp.where(used.reshape(-1), start + left.reshape(-1), _END)
     following = lax.cummin(first_tile, reverse=True)
     return _Walk(

@@ -113,7 +113,9 @@ def receive(
         ]
         reached = _reached(lights, shadows, points, asked)
         known = iter(jnp.maximum(told, 0))
-        return tuple(part if part is None else part + next(known) for part in reached)
+        return tuple(
+            part if part is None else part + next(known).astype(part.dtype) for part in reached
+        )
 
 
 def shone_on(

@@ -92,7 +92,7 @@ def at_texels(values: Shaped[Array, "pictures size size"], number: Int[Array, "*
 
 def texels_round(pictures: Pictures, rays: Rays, texel: Texel) -> Int[Array, "9 n"]:
     """Numbers of the 3×3 texels round those in which rays begin."""
-    last, nine = pictures.face.shape[1] - 1, jnp.arange(9)[:, None]
+    last, nine = pictures.face.shape[1] - 1, jnp.arange(9, dtype=jnp.int32)[:, None]
     row = jnp.clip(texel.row + nine // 3 - 1, 0, last)
     column = jnp.clip(texel.column + nine % 3 - 1, 0, last)
     return number_of(pictures, rays.picture, row, column)

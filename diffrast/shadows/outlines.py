@@ -284,7 +284,7 @@ def _edge_between(
 def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"]) -> Array:
     """Which picture shows points, given from their lights."""
     side = jnp.where(jnp.asarray(lamps.cube)[lamp], cube_side(list(offset)), 0)
-    return jnp.asarray(lamps.first)[lamp] + side
+    return jnp.asarray(lamps.first, jnp.int32)[lamp] + side
 
 
 def _leaves(

@@ -113,7 +113,7 @@ def cube_side(offset: Columns) -> Int[Array, "*size"]:
     size = [jnp.abs(component) for component in offset]
     first = (size[0] >= size[1]) & (size[0] >= size[2])
     axis = jnp.where(first, 0, jnp.where(size[1] >= size[2], 1, 2))
-    return 2 * axis + (_of_axis(axis, offset) < 0)
+    return 2 * axis + (_of_axis(axis, offset) < 0).astype(jnp.int32)
 
 
 def source(light: ShiningLight, view: LightView) -> Float[Array, "4"]:

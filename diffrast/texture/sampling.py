@@ -115,8 +115,8 @@ def sample(
         height = stored(_clamped(_log2_length(steps), last))
         return _trilinear(rows, layout, which, side, coordinates, wrap, height)
     along, height = _ellipse(steps, count)
-    offset = (jnp.arange(count) + 0.5) / count - 0.5
-    offset = offset.reshape(-1, *(1,) * coordinates[0].ndim).astype(coordinates[0].dtype)
+    offset = (jnp.arange(count).astype(coordinates[0].dtype) + 0.5) / count - 0.5
+    offset = offset.reshape(-1, *(1,) * coordinates[0].ndim)
     axis = stored([jnp.where(along, pair[0], pair[1]) for pair in slopes])
     places = stored([c + offset * a for c, a in zip(coordinates, axis, strict=True)])
     height = stored(_clamped(height, last))
