@@ -72,7 +72,7 @@ def cast_outlines(
     casting = [light for light in scene.lights if casts_shadow(light)]
     source = jnp.stack(
         [
-            direction_to_clip(camera, light.direction)
+            direction_to_clip(camera, -light.direction)
             if isinstance(light, DirectionalLight)
             else world_to_clip(replace(camera, distortion=None), light.position)
             for light in casting

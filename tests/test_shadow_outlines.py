@@ -1,6 +1,7 @@
 """Outlines of shadows: found, drawn where they fall, and counted."""
 
 from dataclasses import replace
+from functools import partial
 
 import box_filter
 import jax
@@ -313,3 +314,39 @@ def test_views_with_shadows_and_edges_are_those_of_single_calls():
     for got, camera in zip(together, cameras, strict=True):
         assert len(np.unique(got)) > 5
         np.testing.assert_array_equal(got, dr.render(scene, camera, FEW_PIXELS))
+
+
+def test_outlines_end_where_bodies_go_into_the_ground_and_narrow_strips_darken_nothing_else():
+    """Of two boxes that pierce each other, twice, against many samples.
+
+    An outline ran on beyond the foot of the box that casts it, over the next pixel. And behind the
+    edge of one box a strip of the other, much narrower than a pixel, lies in its shadow: all that
+    the pixels there show of it was dark. The errors were .17 and .28.
+    """
+    boxes = np.reshape(
+        [
+            (223, 187, -97, 259, -296, 149, -58, 199, 20, 118, 225, 432),
+            (52, 19, 340, 595, -305, 88, 37, 348, -129, -201, 49, 512),
+            (234, -216, -134, -507, 172, 383, -7, 214, 138, -111, 235, 137),
+            (9, 92, -277, -111, 306, -177, -24, 229, -157, -341, -62, -164),
+        ],
+        (2, 2, 3, 4),
+    )
+    lights = [[-0.762, -2.227, -1.563], [-1.021, -2.174, -1.558]]
+    eyes = [[0.19, 2.47, 4.306], [0.65, 2.822, 4.253]]
+    ways = [[-0.038, -0.52, -0.853], [-0.119, -0.61, -0.783]]
+
+    def picture(places, direction, eye, way, **options):
+        light = dr.DirectionalLight(direction=direction, shadow=dr.Shadow(resolution=256))
+        objects = [dr.Object(shapes.cube(), transform=place) for place in places]
+        options = dr.RenderSettings(height=32, width=32, shading="flat", **options)
+        camera = dr.Camera.perspective(
+            eye=eye, direction=way, up=(0.1, 1, 0.05), fov_y=0.62, near=0.1, far=50
+        )
+        return dr.render(dr.Scene(objects=objects, lights=[light]), camera, options)
+
+    many = {"antialias": False, "samples": 1024}
+    drawn, sampled = (jax.jit(partial(picture, **options)) for options in ({}, many))
+    for places, *others in zip(boxes, lights, eyes, ways, strict=True):
+        places = jnp.array([[*place / 1000, [0, 0, 0, 1]] for place in places])
+        assert np.max(np.abs(drawn(places, *others) - sampled(places, *others))) < 0.05

@@ -155,8 +155,10 @@ def _told(
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
-    only that it is dark beyond. Where an outline may cross a crease, both sides have the light of
-    the pixel's centre. Of points whose colours are not used no light is asked.
+    only that it is dark beyond, and that it is lit where the pixel's centre shows what is there:
+    the colour that the area loses is the centre's, however narrow a strip lies in the dark. Where
+    an outline may cross a crease, both sides have the light of the pixel's centre. Of points whose
+    colours are not used no light is asked.
     """
     if view.cast is None:
         return None
@@ -170,7 +172,8 @@ def _told(
     crossed = ~found.fold & shown & (front < 0) & (beyond < 0)
     front, beyond = jnp.where(crossed, here, jnp.stack([front, beyond]))
     front = jnp.where(found.fold, -1, front)
-    beyond = jnp.where(found.fold & (beyond > 0), -1, beyond)
+    asked = found.fold & ~found.beyond.is_centre
+    beyond = jnp.where(asked & (beyond > 0), -1, beyond)
     inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
     told = [front, beyond] + [inwards] * (points - 2)
     return jnp.concatenate([jnp.where(found.visible, part, 0) for part in told], axis=1)

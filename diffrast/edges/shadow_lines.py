@@ -35,6 +35,7 @@ from diffrast.edges.planes import (
 )
 from diffrast.edges.shadow_planes import (
     Plane,
+    behind_edge,
     edge_plane,
     end_plane,
     face_plane,
@@ -54,6 +55,7 @@ _FACES = 4  # on so many faces
 _REACH = 0.75  # pixels from the centre: farther than the corners
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
+_STEEP = 1e-3  # of its size: how far an edge at least goes into the plane of a face
 _ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
 _ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
 _BLUNT = 0.05  # cosine: of sharper corners the sides are moved less far than that takes
@@ -78,7 +80,7 @@ class Cast(NamedTuple):
     lit: Bool[Array, "lights height_with_border width_with_border"]
     patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
     turned: Bool[Array, "lights F"]  # faces that turn their outside to the light
-    source: Float[Array, "lights 4"]  # clip position
+    source: Float[Array, "lights 4"]  # clip position, or direction to the light
     weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
     parallel: Bool[Array, ""]  # whether the weight moves with the light
 
@@ -214,8 +216,12 @@ def cross_shadows(
     tip = place(faces[caster, third])
     above = dot_rows(shadow.normal, tip) + shadow.offset
     ends_of = [end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
+    behind = behind_edge(source[:, None], weight, shadow, *ends)
     ground = Plane(ground.normal[:, None], ground.offset[None])
-    shadow, *ends_of = (Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, *ends_of))
+    shadow, behind, *ends_of = (
+        Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, behind, *ends_of)
+    )
+    enters = _enter(ground, source, weight, ends)
     normal, foot, inverse = stored(line_of(ground, shadow))
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
@@ -261,8 +267,8 @@ def cross_shadows(
     side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
     along = _REACH * jnp.stack([-normal[1], normal[0]])
-    limits = [meeting(ground, plane) for plane in ends_of]
-    cut = [jnp.any(meet & chosen, axis=1)[:, None] for meet in meets]
+    limits = [meeting(ground, plane) for plane in (*ends_of, behind)]
+    cut = [*(jnp.any(meet & chosen, axis=1)[:, None] for meet in meets), enters]
 
     def inside(at: Array) -> list[Array]:
         x, y = at
@@ -324,6 +330,20 @@ def _unlike(values: Array, used: Array, count: int) -> tuple[Int[Array, "count n
     number = jnp.where(new, jnp.cumsum(new, axis=0) - 1, -1)
     rows = jnp.stack([first_row(number == k) for k in range(count)])
     return stored_together((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
+
+
+def _enter(
+    ground: Plane, source: Float[Array, "3 n"], weight: Float[Array, " n"], ends: list[Array]
+) -> Bool[Array, "edges faces n"]:
+    """Whether edges go into the planes of faces, or end there: no shadow falls beyond.
+
+    Not those that lie in them.
+    """
+    first, last = (dot_rows(ground.normal, end[:, :, None]) + ground.offset for end in ends)
+    to_light = dot_rows(ground.normal, source[:, None, None]) + ground.offset * weight
+    size = largest(ends[1] - ends[0])[:, None]
+    lower = jnp.where(to_light < 0, -jnp.maximum(first, last), jnp.minimum(first, last))
+    return stored((lower < _EDGE_ON * size) & (jnp.abs(last - first) > _STEEP * size))
 
 
 def _common(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:

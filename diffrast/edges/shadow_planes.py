@@ -50,6 +50,13 @@ def edge_plane(shadow: Plane, start: Array, end: Array) -> Plane:
     return _through(cross_rows(end - start, shadow.normal), start)
 
 
+def behind_edge(source: Array, weight: Array, shadow: Plane, start: Array, end: Array) -> Plane:
+    """The plane through the edge likewise; positive on the other side than the light."""
+    plane = edge_plane(shadow, start, end)
+    sign = jnp.where(dot_rows(plane.normal, source) + plane.offset * weight > 0, -1, 1)
+    return Plane(sign * plane.normal, sign * plane.offset)
+
+
 def meeting(ground: Plane, plane: Plane) -> Float[Array, "3 *n"]:
     """The line a x + b y + c = 0 on the screen where planes meet: (a, b, c)."""
     return ground.offset * plane.normal - plane.offset * ground.normal
