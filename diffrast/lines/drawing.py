@@ -13,7 +13,7 @@ from diffrast import _check
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass
 from diffrast.lines.blend import add_lines
-from diffrast.lines.hidden import Surface, surface_of
+from diffrast.lines.hidden import Surface, from_middle, surface_of
 from diffrast.lines.pixels import last_lines, nearest_lines
 from diffrast.lines.segments import Segments, segments_from_clip, segments_from_pixels
 from diffrast.raster import Fragments
@@ -227,9 +227,7 @@ def _fragments(
     covered, at = line >= 0, jnp.maximum(line, 0)
     change = jnp.abs(segments.end - segments.start)[at]
     steep = change[..., 1] > change[..., 0]
-    dtype = positions_clip.dtype
-    x_pixel = jnp.arange(width).astype(dtype) + (1 - width) / 2
-    y_pixel = ((height - 1) / 2 - jnp.arange(height).astype(dtype))[:, None]
+    x_pixel, y_pixel = from_middle(height, width, positions_clip.dtype)
     ends, depths = [], []
     for k in range(2):
         point = positions_clip[lines[at, k]]

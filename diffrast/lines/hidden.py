@@ -33,6 +33,14 @@ class Surface(NamedTuple):
     slopes: tuple[Float[Array, " pixels"], Float[Array, " pixels"]]
 
 
+def from_middle(
+    height: int, width: int, dtype: jnp.dtype
+) -> tuple[Float[Array, " width"], Float[Array, "height 1"]]:
+    """Where the centres of pixels lie from the picture's middle, to the right and upwards."""
+    right = jnp.arange(width).astype(dtype) + (1 - width) / 2
+    return right, ((height - 1) / 2 - jnp.arange(height).astype(dtype))[:, None]
+
+
 @jax.jit
 def surface_of(
     positions_clip: Float[Array, "points 4"],
@@ -52,9 +60,7 @@ def surface_of(
     unit = jnp.where(unit > 0, unit, 1)
     rank, positions_clip = depth_rank(positions_clip) / unit, positions_clip / unit
     corners = corners_at(faces, fragments.face)
-    dtype = positions_clip.dtype
-    x_pixel = jnp.arange(width).astype(dtype) + (1 - width) / 2
-    y_pixel = ((height - 1) / 2 - jnp.arange(height).astype(dtype))[:, None]
+    x_pixel, y_pixel = from_middle(height, width, positions_clip.dtype)
     ranks, weights, x, y = [], [], [], []
     for corner in corners:
         w = positions_clip[corner, 3]
