@@ -54,6 +54,12 @@ class Fragments:
     depth_gap: np.ndarray
 
 
+def area_of(corners):
+    """Of a polygon."""
+    x, y = np.moveaxis(np.asarray(corners, float), -1, 0)
+    return abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+
+
 def rasterize(
     positions_clip, faces, height, width, cull_backfaces=False, samples=1, offset=(0.5, 0.5)
 ) -> Fragments:

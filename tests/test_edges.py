@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import area_of
 
 import diffrast as dr
 from diffrast._selection import prefix_sum
@@ -328,11 +329,6 @@ def test_where_one_surface_ends_another_may_lie_beyond(eye, error):
         for options in ({}, {"antialias": False, "samples": 256})
     )
     assert np.sqrt(np.mean((image - exact) ** 2)) < error
-
-
-def area_of(corners):
-    x, y = np.moveaxis(np.asarray(corners, float), -1, 0)
-    return abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
+from reference import area_of
 from shadow_scenes import FRAME, ROUND_THE_CORNER, SIZE, ball, floor, make, settings, sun
 
 import diffrast as dr
@@ -150,10 +151,6 @@ def test_outlines_through_centres_of_pixels_bound_their_exact_area():
         scene = dr.Scene(objects=[thing, dr.Object(shapes.plane(72, 72))], lights=[light])
         image = dr.render(scene, camera, options)[:, 8:, 0]
         return 1 - image / jax.lax.stop_gradient(image[0, -1])
-
-    def area_of(quad):
-        (x, y), (x_next, y_next) = quad.T, np.roll(quad, -1, axis=0).T
-        return np.sum(x * y_next - y * x_next) / 2
 
     def value_and_derivative(quad):
         dark, pull_back = jax.vjp(picture, quad)
