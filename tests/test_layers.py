@@ -62,6 +62,7 @@ ORDER = [
     "diffrast.edges.areas",
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_planes",
+    "diffrast.edges.shadow_ends",
     "diffrast.edges.shadow_lines",
     "diffrast.edges.records",
     "diffrast.edges.blend",

@@ -38,7 +38,7 @@ from diffrast.edges.neighborhood import (
     walk,
 )
 from diffrast.edges.pieces import positive_part
-from diffrast.edges.planes import TOLERANCE, Table, area, corners_of, room_in_pixel
+from diffrast.edges.planes import ASIDE, TOLERANCE, Table, area, corners_of, room_in_pixel
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 128
@@ -50,7 +50,6 @@ _FINE = 2.0  # square pixels: faces of half this area count as small ones
 _WALKS = 4  # one after the other
 _NEAR = 1.5  # pixels from the centre to where the planes meet that are known at first
 _CLOSE = 0.1  # pixels from where two walks ended to where the planes found there meet
-_ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
 _FACES = 2 + 9 + 2 * 3 + 1
 _CENTRE = 2  # the row of what the pixel's centre shows, and the first of the nine pixels
 _NEAREST_FIRST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # the order of these
@@ -412,9 +411,9 @@ def _kept_aside(
     """
     to_front = -(point[0] * normal[0] + point[1] * normal[1])  # of the first face, as at the centre
     shown = jnp.where(at_centre == bodies[0], 1, jnp.where(at_centre == bodies[1], -1, 0))
-    close = jnp.abs(to_front) < _ASIDE
+    close = jnp.abs(to_front) < ASIDE
     moves = (shown != 0) & (close | (jnp.any(whole, axis=0) & (shown * to_front < 0)))
-    return stored(jnp.where(moves, -shown * (_ASIDE * normal), point))
+    return stored(jnp.where(moves, -shown * (ASIDE * normal), point))
 
 
 def _hidden(planes: _Planes, others: Array, x: Array, y: Array, depth: Array) -> Array:

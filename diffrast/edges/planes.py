@@ -17,6 +17,7 @@ TOLERANCE = 1e-4  # of 1/w: surfaces nearer to one another than this touch
 FINE_TOLERANCE = 1e-3  # of 1/w: the same between faces of one surface, and for tiny ones
 _BEYOND = 1e-4  # pixels from the edge to the point that shows what is behind it,
 _ROUNDINGS = 8  # of a position, if that is more
+ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
 _TO_THE_LEFT = 2.0**-14  # pixels: as much as squares of pixels lie to the left of, and above, them
 
 Columns = list[Float[Array, "*n"]]

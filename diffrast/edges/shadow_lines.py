@@ -33,6 +33,15 @@ from diffrast.edges.planes import (
     largest,
     room_in_pixel,
 )
+from diffrast.edges.shadow_ends import (
+    REACH,
+    ROUNDED,
+    common,
+    continued,
+    enter,
+    past_centre,
+    same_place,
+)
 from diffrast.edges.shadow_planes import (
     Plane,
     behind_edge,
@@ -52,15 +61,8 @@ _CROSS = _NEAREST[:5]  # and of them the middle one, and the four next to it
 _CERTAIN = 8  # times as much as another one tells the middle one where outlines end
 _EDGES = 4  # whose shadows part a pixel, at most,
 _FACES = 4  # on so many faces
-_REACH = 0.75  # pixels from the centre: farther than the corners
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
-_STEEP = 1e-3  # of its size: how far an edge at least goes into the plane of a face
-_ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
-_ASIDE = 1e-4  # pixels from a line to a centre that it must not pass
-_BLUNT = 0.05  # cosine: of sharper corners the sides are moved less far than that takes
-_FLAT = 0.1  # pixels: how far lines on faces that count as one plane may be apart
-_ONE_LINE = 1e-3  # pixels: how far lines on two faces that are one may be apart
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
 # Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
@@ -107,7 +109,7 @@ class Outlines(NamedTuple):
     looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
     centre_is_lit: Bool[Array, " n"]  # in the image
     alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light
-    shift: Float[Array, "2 n"]  # of all lines of a pixel: see `_past_centre`
+    shift: Float[Array, "2 n"]  # of all lines of a pixel: see `past_centre`
     range: Float[Array, "2 edges faces n"]  # begin and end, from the point next to the centre
     lines: Int[Array, " list"]  # (edge * faces + face) * n + number of the pixel
     total: Int[Array, ""]  # of lines
@@ -221,7 +223,7 @@ def cross_shadows(
     shadow, behind, *ends_of = (
         Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, behind, *ends_of)
     )
-    enters = _enter(ground, source, weight, ends)
+    enters = enter(ground, source, weight, ends)
     normal, foot, inverse = stored(line_of(ground, shadow))
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
@@ -240,7 +242,7 @@ def cross_shadows(
     usable = valid[:, None] & received & (inverse > 0)
 
     # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
-    meets = [_same_place(end, ends) & valid[:, None] & valid for end in ends]
+    meets = [same_place(end, ends) & valid[:, None] & valid for end in ends]
     linked = meets[0] | meets[1]
     primary = valid & (jnp.arange(_EDGES, dtype=jnp.int32)[:, None] == first_row(valid))
     chain = primary
@@ -266,7 +268,7 @@ def cross_shadows(
     ends_others = decided & valid[:, None] & valid & (chain[:, None] != chain)
     side = jnp.where(wrong[0] < wrong[1], 1, -1)
 
-    along = _REACH * jnp.stack([-normal[1], normal[0]])
+    along = REACH * jnp.stack([-normal[1], normal[0]])
     limits = [meeting(ground, plane) for plane in (*ends_of, behind)]
     cut = [*(jnp.any(meet & chosen, axis=1)[:, None] for meet in meets), enters]
 
@@ -291,14 +293,14 @@ def cross_shadows(
         [jnp.where(on, 1, v) for on, v in zip(goes_on, end, strict=True)] for end in values
     ]
     on_face, on_surface = positive_part(*values), positive_part(*ends_there)
-    low, high = _continued(
-        _common(in_pixel, on_face), _common(in_pixel, on_surface), usable, foot, along
+    low, high = continued(
+        common(in_pixel, on_face), common(in_pixel, on_surface), usable, foot, along
     )
     drawn = chosen[:, None] & usable & (low < high)
-    range_ = stored(_REACH * (2 * jnp.stack([low, high]) - 1))
+    range_ = stored(REACH * (2 * jnp.stack([low, high]) - 1))
     alone = counts[4] & (jnp.sum(drawn, axis=(0, 1)) == 1)
-    passed = alone | ((range_[0] < _ROUNDED) & (range_[1] > -_ROUNDED))
-    passed = drawn & counts[4] & passed & (jnp.abs(beyond) < _ROUNDED)
+    passed = alone | ((range_[0] < ROUNDED) & (range_[1] > -ROUNDED))
+    passed = drawn & counts[4] & passed & (jnp.abs(beyond) < ROUNDED)
     lines, total = selected(drawn.reshape(_EDGES * _FACES, -1))
     return Outlines(
         places=places,
@@ -312,7 +314,7 @@ def cross_shadows(
         looks=looks,
         centre_is_lit=lit[4],
         alone=alone,
-        shift=_past_centre(outwards, beyond, passed, lit[4]),
+        shift=past_centre(outwards, beyond, passed, lit[4]),
         range=range_,
         lines=lines,
         total=total,
@@ -330,92 +332,6 @@ def _unlike(values: Array, used: Array, count: int) -> tuple[Int[Array, "count n
     number = jnp.where(new, jnp.cumsum(new, axis=0) - 1, -1)
     rows = jnp.stack([first_row(number == k) for k in range(count)])
     return stored_together((jnp.where(rows < values.shape[0], rows, 0), rows < values.shape[0]))
-
-
-def _enter(
-    ground: Plane, source: Float[Array, "3 n"], weight: Float[Array, " n"], ends: list[Array]
-) -> Bool[Array, "edges faces n"]:
-    """Whether edges go into the planes of faces, or end there: no shadow falls beyond.
-
-    Not those that lie in them.
-    """
-    first, last = (dot_rows(ground.normal, end[:, :, None]) + ground.offset for end in ends)
-    to_light = dot_rows(ground.normal, source[:, None, None]) + ground.offset * weight
-    size = largest(ends[1] - ends[0])[:, None]
-    lower = jnp.where(to_light < 0, -jnp.maximum(first, last), jnp.minimum(first, last))
-    return stored((lower < _EDGE_ON * size) & (jnp.abs(last - first) > _STEEP * size))
-
-
-def _common(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    """What parts of lines have in common, from begin to end."""
-    return jnp.maximum(one[0], other[0]), jnp.minimum(one[1], other[1])
-
-
-def _continued(
-    own: tuple[Array, Array],
-    room: tuple[Array, Array],
-    usable: Bool[Array, "edges faces n"],
-    foot: Float[Array, "2 edges faces n"],
-    along: Float[Array, "2 edges faces n"],
-) -> tuple[Array, Array]:
-    """Begins and ends of lines on faces, 0 to 1, where other faces are not known.
-
-    What is not on its `own` face goes on in that face's plane, as far as there is `room`, before
-    the first one of the faces and behind each up to the next. Along an edge between two it is on
-    one of them.
-    """
-    low, high = own
-    here = usable & (low < high)
-    axis = along[:, :, :1]
-    step, at = dot_rows(along, axis), dot_rows(foot, axis)
-    begin, end = (at + (2 * part - 1) * step for part in own)
-    middle = jnp.where(here, begin + end, jnp.inf)
-    order = jnp.arange(_FACES)[:, None, None]
-    one, other = middle[:, :, None], middle[:, None]
-    later = here[:, None] & (
-        (other > one) | ((other == one) & (jnp.arange(_FACES)[:, None] > order))
-    )
-    aside = _cross(axis, foot) / _REACH
-    beside = jnp.abs(aside[:, :, None] - aside[:, None]) < _ONE_LINE
-    again = jnp.any(
-        here[:, :, None] & later & beside & (2 * begin[:, None] < middle[:, :, None]), axis=1
-    )
-    here, later = here & ~again, later & ~again[:, None]
-    low, high = jnp.where(again, 1, low), jnp.where(again, 0, high)
-    following = jnp.min(jnp.where(later, begin[:, None], jnp.inf), axis=2)
-    first = here & (jnp.sum(later, axis=2) == jnp.sum(here, axis=1, keepdims=True) - 1)
-    alike = step > 0.5 * dot_rows(axis, axis)  # in direction
-    up_to = ((following - at) / jnp.where(alike, step, 1) + 1) / 2
-    longer = jnp.maximum(high, jnp.minimum(room[1], up_to))
-    # Where it is on none, but all of these are one plane, or nearly: in the first.
-    apart = [
-        _cross(along, foot[:, :, :1] + sign * along[:, :, :1] - foot) / _REACH for sign in (1, -1)
-    ]
-    flat = jnp.all(~usable | (jnp.maximum(*map(jnp.abs, apart)) < _FLAT), axis=1, keepdims=True)
-    alone = flat & ~jnp.any(here, axis=1, keepdims=True) & (jnp.arange(_FACES)[:, None] == 0)
-    low = jnp.where((first & alike) | alone, room[0], low)
-    high = jnp.where(here & alike, longer, jnp.where(alone, room[1], high))
-    return stored((low, high))
-
-
-def _past_centre(
-    outwards: Float[Array, "2 edges faces n"],
-    beyond: Float[Array, "edges faces n"],
-    passed: Bool[Array, "edges faces n"],
-    is_lit: Bool[Array, " n"],
-) -> Float[Array, "2 n"]:
-    """How far lines that pass a pixel's centre are moved, to have it on the side that it shows.
-
-    Rounding decides else where lines through a centre have it. All of a pixel are moved alike, so
-    that corners stay whole; `outwards`, from dark to lit, and how far out they lie as there.
-    """
-    side = jnp.where(is_lit, -1, 1)
-    way = jnp.sum(jnp.where(passed, outwards, 0), axis=(1, 2))
-    size = jnp.hypot(*way)
-    way = way / jnp.where(size > 0, size, 1)
-    gained = jnp.maximum(dot_rows(outwards, way[:, None, None]), _BLUNT)
-    lacking = jnp.where(passed, (_ASIDE - side * beyond) / gained, 0)
-    return stored(side * jnp.clip(jnp.max(lacking, axis=(0, 1)), 0, 2 * _ROUNDED) * way)
 
 
 @jax.jit
@@ -525,18 +441,8 @@ def light_told(
     return stored(jnp.where(cast.turned[:, face], told, 0))
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return a[0] * b[1] - a[1] * b[0]
-
-
 def _of_screen(motion: Array, pixel: Array) -> Array:
     """By x, y and w of the screen what is given by those from a pixel's centre."""
     x, y, w = motion
     column, row = pixel.astype(w.dtype) + 0.5
     return jnp.stack([x, y, w - column * x - row * y])
-
-
-def _same_place(end: Array, others: list[Array]) -> Array:
-    """Which ends (3, edges, n) are where others are, shape (edges, edges, n); not their own."""
-    same = [jnp.all(end[:, :, None] == other[:, None], axis=0) for other in others]
-    return (same[0] | same[1]) & ~jnp.eye(end.shape[1], dtype=bool)[..., None]
