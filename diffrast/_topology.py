@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast import _check
 
+SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
+
 
 class EdgeAdjacency(NamedTuple):
     """Every edge once, with the faces that meet there; all arrays are int32.
@@ -54,8 +56,8 @@ class Topology(NamedTuple):
     Attributes:
         edges: every edge once.
         neighbors: the faces across the three edges of each face, −1 where there is none.
-        patches: a number for each face, the same for faces that hang together by shared vertices,
-            over which attributes are continuous.
+        patches: a number for each face, the same for faces that hang together over edges at which
+            attributes are continuous: by shared vertices, or by ones that are alike.
         bodies: the same for faces that hang together by vertices at the same place; None if all
             do.
     """
@@ -142,8 +144,17 @@ def edge_adjacency(positions: np.ndarray, faces: np.ndarray) -> EdgeAdjacency:
     return EdgeAdjacency(*(a.astype(np.int32) for a in (edges, edge_faces, opposite)))
 
 
-def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
-    """How a mesh hangs together, for rasterising."""
+class Attributes(NamedTuple):
+    """What vertices have of their own, if they do."""
+
+    normals: np.ndarray | None
+    uvs: np.ndarray | None
+
+
+def topology_of(
+    positions: np.ndarray, faces: np.ndarray, attributes: Attributes | None = None
+) -> Topology:
+    """How a mesh hangs together, for rasterising; `attributes` are `None` if they are not known."""
     adjacency = edge_adjacency(positions, faces)
     welded = representatives(positions)
     ends = welded[adjacency.edges]
@@ -168,7 +179,46 @@ def topology_of(positions: np.ndarray, faces: np.ndarray) -> Topology:
     edges = Edges(adjacency.edge_faces, packed, seam)
     bodies = _joined(welded[faces], len(positions))
     whole = bool(np.all(bodies == bodies[0]))
-    return Topology(edges, neighbors, _joined(faces, len(positions)), None if whole else bodies)
+    alike = np.zeros((0, 3), int)
+    if attributes is not None:
+        alike = _alike(positions, faces, edges, attributes)
+    patches = _joined(np.concatenate([faces, alike]), len(positions))[: len(faces)]
+    return Topology(edges, neighbors, patches, None if whole else bodies)
+
+
+def _alike(
+    positions: np.ndarray, faces: np.ndarray, edges: Edges, attributes: Attributes
+) -> np.ndarray:
+    """Vertices on both sides of seams over which attributes go on, three a row as faces have them.
+
+    Vertices without normals have those of their faces.
+    """
+    normals, uvs = attributes
+    seams = np.flatnonzero(edges.seam)
+    beside = faces[edges.faces[seams]]
+    one, other = (
+        np.take_along_axis(beside[:, side], np.stack(divmod(edges.corners[seams, side], 3), 1), 1)
+        for side in range(2)
+    )
+    if normals is None:
+        normals = _smooth_normals(positions, faces)
+    size = np.max(np.abs(normals), axis=1)
+    apart = np.max(np.abs(normals[one] - normals[other]), axis=2)
+    alike = np.all(apart <= SAME_NORMAL * (size[one] + size[other]), axis=1)
+    if uvs is not None:
+        alike &= np.all(uvs[one] == uvs[other], axis=(1, 2))
+    return np.stack([one[alike, 0], other[alike, 0], one[alike, 1]], axis=1)
+
+
+def _smooth_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals at vertices, by the area of the faces there; zero where they cancel."""
+    a, b, c = np.moveaxis(positions.astype(np.float64)[faces], 1, 0)
+    area_vector = np.cross(b - a, c - a)
+    sums = np.zeros(positions.shape)
+    for corner in range(3):
+        np.add.at(sums, faces[:, corner], area_vector)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return sums / np.where(length > 0, length, 1)
 
 
 def _joined(faces: np.ndarray, count: int) -> np.ndarray:

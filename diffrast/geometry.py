@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float, Int
 
 from diffrast._stored import stored, stored_rows
-from diffrast._topology import Edges, Topology, traced_topology
+from diffrast._topology import SAME_NORMAL, Edges, Topology, traced_topology
 from diffrast._varying import varying_zero
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
 from diffrast.edges.planes import largest
@@ -42,7 +42,6 @@ from diffrast.raster.fragments import with_border
 from diffrast.scene import Scene
 
 FEW_OBJECTS = 32  # what their transforms move is summed over the picture, for each of them
-_SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
 
 
 class Geometry(NamedTuple):
@@ -337,5 +336,5 @@ def _bent_seams(edges: Edges, normals: Array, faces: Array) -> Array:
     corner = jnp.stack([edges.corners // 3, edges.corners % 3])  # (2 ends, E, 2 faces)
     vertex = faces[jnp.maximum(edges.faces, 0), corner]
     one, other = jnp.moveaxis(normals.T[:, vertex], -1, 0)  # (3, 2 ends, E) each
-    apart = largest(one - other) > _SAME_NORMAL * (largest(one) + largest(other))
+    apart = largest(one - other) > SAME_NORMAL * (largest(one) + largest(other))
     return edges.seam & jnp.any(apart, axis=0)

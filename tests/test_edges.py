@@ -620,10 +620,21 @@ def test_topology_is_the_same_whether_traced_or_not():
             return sorted(map(tuple, np.column_stack([pairs, np.asarray(edges.seam)[used]])))
 
         assert rows(host.edges, slice(None)) == rows(traced.edges, used)
-    cube = dr.shapes.cube().topology
-    assert len(np.unique(cube.patches)) == 12  # each triangle has vertices of its own
-    assert np.all(np.asarray(cube.neighbors) >= 0)
-    assert len(np.unique(MESH.topology.patches)) == 1
+    assert np.all(np.asarray(dr.shapes.cube().topology.neighbors) >= 0)
+
+
+def test_faces_with_vertices_of_their_own_are_one_surface_where_these_are_alike():
+    def surfaces(mesh):
+        return len(np.unique(mesh.topology.patches))
+
+    cube, ball = dr.shapes.cube(), dr.shapes.icosphere(1)
+    split = dr.mesh.flat_shaded(ball)
+    bare = dr.Mesh(vertices=cube.vertices, faces=cube.faces)  # with its faces' normals
+    uvs = np.stack([np.arange(len(cube.vertices)), np.zeros(len(cube.vertices))], axis=1)
+    assert (surfaces(cube), surfaces(bare)) == (6, 6)
+    assert surfaces(dataclasses.replace(cube, uvs=uvs, topology=None)) == 12
+    assert surfaces(dr.mesh.with_normals(cube)) == 1
+    assert (surfaces(ball), surfaces(split), surfaces(dr.mesh.with_normals(split))) == (1, 80, 1)
 
 
 def test_topology_of_other_faces_is_refused():

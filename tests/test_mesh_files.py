@@ -243,6 +243,15 @@ def test_obj_materials_may_differ_in_what_their_corners_have(tmp_path):
     np.testing.assert_array_equal(corners(read, "normals")[:, 0], [z, [1, 0, 0], z])
 
 
+def test_faces_in_the_order_of_the_file_know_which_of_them_meet(tmp_path):
+    write(tmp_path / "m.mtl", "newmtl plain\nnewmtl full\n")
+    text = "mtllib m.mtl\n" + QUAD + "v 0 0 9\nvn 1 0 0\nusemtl plain\nf 1 2 3\n"
+    text += "usemtl full\nf 1//1 3//1 4//1\nusemtl plain\nf 1 2 5\n"
+    mesh = load_mesh(write(tmp_path / "a.obj", text))
+    again = dr.Mesh(vertices=mesh.vertices, faces=mesh.faces)
+    np.testing.assert_array_equal(mesh.topology.neighbors, again.topology.neighbors)
+
+
 @pytest.mark.parametrize(
     ("line", "color"),
     [

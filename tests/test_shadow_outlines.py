@@ -78,9 +78,12 @@ def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
 
 
 def test_outlines_on_ground_of_faces_of_a_pixel_are_those_on_ground_of_two_faces():
-    """Picture and derivative by the lamp; more faces lie in a pixel than are looked at."""
+    """Picture and derivative by the lamp; more faces lie in a pixel than are looked at.
+
+    Also where each face has vertices of its own.
+    """
     grounds = [shapes.plane(2.9, 2.9, divisions=count) for count in (1, 4, 24)]
-    grounds = dr.mesh.stack_meshes(grounds)
+    grounds = dr.mesh.stack_meshes([*grounds, dr.mesh.flat_shaded(grounds[1])])
     camera = dr.Camera.perspective(eye=(0.5, 3.0, 4.6), target=(-0.1, -0.4, 0), **FRAME)
     place = linalg.compose(linalg.translation((0, -0.9, 0)), linalg.rotation_x(-1.5))
     thing = dr.Object(shapes.icosphere(2, 0.42), transform=linalg.translation((0.3, 0.1, 0.2)))
@@ -97,7 +100,7 @@ def test_outlines_on_ground_of_faces_of_a_pixel_are_those_on_ground_of_two_faces
         return image, jax.lax.map(derivative, jnp.eye(3))
 
     (image, want), *others = (
-        picture_and_derivatives(jax.tree.map(lambda part, k=k: part[k], grounds)) for k in range(3)
+        picture_and_derivatives(jax.tree.map(lambda part, k=k: part[k], grounds)) for k in range(4)
     )
     for other, got in others:
         assert np.mean(np.abs(other - image)) < 5e-5

@@ -80,7 +80,9 @@ def load_mesh(path: str | Path) -> Mesh:
     """
     parts, order = _read_parts(file_path("path", path), materials=False)
     mesh = _merged([part.mesh for part in parts])
-    return mesh if order is None else dataclasses.replace(mesh, faces=mesh.faces[order])
+    if order is None:
+        return mesh
+    return dataclasses.replace(mesh, faces=mesh.faces[order], topology=None)
 
 
 def load_mesh_parts(path: str | Path) -> list[MeshPart]:

@@ -90,7 +90,9 @@ def with_normals(mesh: Mesh, *, weighting: str = "area", weld: bool = True) -> M
     _check.one_of("weighting", weighting, WEIGHTINGS)
     groups = jnp.asarray(_weld(mesh.vertices)) if _check.flag("weld", weld) else None
     normals = _vertex_normals(mesh.vertices, mesh.faces, groups, weighting)
-    return replace(mesh, normals=normals)
+    # Which vertices are alike is another matter with these, where it can be found.
+    known = _check.is_concrete(mesh.vertices) and _check.is_concrete(mesh.faces)
+    return replace(mesh, normals=normals, topology=None if known else mesh.topology)
 
 
 _weld = weld  # `weld` is also the name of an option

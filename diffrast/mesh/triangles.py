@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from diffrast import _check, _topology
 from diffrast._check import ArrayInput
 from diffrast._pytree import pytree_dataclass, set_field
-from diffrast._topology import Topology
+from diffrast._topology import Attributes, Topology
 
 
 @pytree_dataclass
@@ -78,7 +78,8 @@ class Mesh:
         set_field(self, "uvs", uvs)
         set_field(self, "uv_faces", uv_faces)
         if topology is None:
-            topology = _topology_of(positions, indices)
+            own_uvs = uvs if uv_faces is None else None
+            topology = topology_where_known(positions, indices, normals, own_uvs)
         elif not isinstance(topology, Topology):
             _check.instance_of("topology", topology, Topology)
         elif topology.patches.shape[0] != indices.shape[0]:
@@ -89,10 +90,16 @@ class Mesh:
         set_field(self, "topology", topology)
 
 
-def _topology_of(vertices: Array, faces: Array) -> Topology | None:
+def topology_where_known(
+    vertices: Array, faces: Array, normals: Array | None, uvs: Array | None
+) -> Topology | None:
+    """Of vertices and faces that are known, `None` of others; `uvs` are the vertices' own."""
     if not (_check.is_concrete(vertices) and _check.is_concrete(faces)):
         return None
-    topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces))
+    attributes = None
+    if _check.is_concrete(normals) and _check.is_concrete(uvs):
+        attributes = Attributes(*(None if a is None else np.asarray(a) for a in (normals, uvs)))
+    topology = _topology.topology_of(np.asarray(vertices), np.asarray(faces), attributes)
     with _check.staying_known(vertices, faces):
         return jax.tree.map(jnp.asarray, topology)
 
