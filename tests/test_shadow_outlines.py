@@ -77,6 +77,35 @@ def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():
     assert np.linalg.norm(blurred[0] - blurred[1]) < 0.05 * np.linalg.norm(blurred[1])
 
 
+def test_outlines_of_a_lamp_under_parallel_projection_are_as_bright_as_the_ground_there():
+    """On large faces that come towards the viewer, where light changes from place to place."""
+    size = 32
+    camera = dr.Camera.orthographic(
+        eye=(1, 5, 4), target=(0, -0.8, 0), up=(0, 1, 0), height=5.0, near=0.1, far=50.0
+    )
+    turned = linalg.compose(linalg.rotation_y(0.5), linalg.scaling(0.5))
+    lamp = dr.PointLight(position=(1.3, 1.6, 0.9), shadow=dr.Shadow())
+    scene = dr.Scene(objects=[dr.Object(shapes.cube(), None, turned), floor()], lights=[lamp])
+    options = dr.RenderSettings(height=size, width=size, shading="flat")
+    oracle = scenes.Oracle(scene, camera.view, camera.projection)
+    want = box_filter.render_box(
+        oracle.positions,
+        oracle.normals,
+        oracle.faces,
+        oracle.view,
+        oracle.projection,
+        lights=[light | {"shadow": True} for light in oracle.lights],
+        material=oracle.material(),
+        height=size,
+        width=size,
+        shading="flat",
+        lines=64,
+    )
+    error = np.abs(dr.render(scene, camera, options) - want)
+    assert np.mean(error) < 3e-4
+    assert np.max(error) < 0.02
+
+
 def test_outlines_on_ground_of_faces_of_a_pixel_are_those_on_ground_of_two_faces():
     """Picture and derivative by the lamp; more faces lie in a pixel than are looked at.
 

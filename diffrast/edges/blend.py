@@ -139,14 +139,22 @@ def _shade(
     """Colours of points on faces, several of each piece at once."""
     assert method.shader is not None
     face, barycentrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *points)
-    if view.scale is not None:
-        scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
-        barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
-        total = barycentrics[0] + barycentrics[1] + barycentrics[2]
-        inverse_total = 1 / jnp.where(total > 0, total, 1)
-        barycentrics = [part * inverse_total for part in barycentrics]
+    barycentrics = _on_faces(view, face, barycentrics)
     colors = stored_together(method.shader(view.scene, face, barycentrics, told))
     return jnp.split(jnp.stack(colors), len(points), axis=1)
+
+
+def _on_faces(
+    view: View, face: Int[Array, " n"], barycentrics: list[Float[Array, " n"]]
+) -> list[Float[Array, " n"]]:
+    """Barycentric coordinates of the faces as they are, given those of the scaled ones."""
+    if view.scale is None:
+        return barycentrics
+    scale = stored(view.scale[view.faces[jnp.maximum(face, 0)]])
+    barycentrics = [part * scale[:, i] for i, part in enumerate(barycentrics)]
+    total = barycentrics[0] + barycentrics[1] + barycentrics[2]
+    inverse_total = 1 / jnp.where(total > 0, total, 1)
+    return [part * inverse_total for part in barycentrics]
 
 
 def _told(
@@ -286,7 +294,8 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     assert method.glow is not None
     assert view.cast is not None
     area = stored(area_beyond(line.begin, line.end))
-    colors = method.glow(view.scene, line.light, line.face, line.barycentrics)
+    barycentrics = _on_faces(view, line.face, line.barycentrics)
+    colors = method.glow(view.scene, line.light, line.face, barycentrics)
     glow = jnp.stack(stored_together(colors))
     jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
     own = stored(_colors(view.image, _place(view, line.pixel, 4)))
