@@ -160,6 +160,21 @@ def test_an_outline_on_the_border_between_pixels_belongs_to_one_of_them():
         np.testing.assert_allclose(np.sum(on_border[rows]), np.sum(near[rows]), rtol=0.25)
 
 
+@pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (1.0, 0.0, -1.0)])
+def test_beside_walls_along_light_and_sight_through_centres_the_ground_is_lit(direction):
+    """Where their shadow would begin the box has its outline; pixels there show half of each."""
+    corners = np.asarray(shapes.cube().vertices) * [1.5, 1.5, 0.5] + [0, 0, 0.5]
+    box = dr.Object(dr.Mesh(vertices=corners, faces=shapes.cube().faces), dr.Material())
+    ground = dr.Object(shapes.plane(60, 60), dr.Material(diffuse=(0.3, 0.5, 0.7)))
+    light = dr.DirectionalLight(direction=direction, shadow=dr.Shadow(resolution=128))
+    camera = dr.Camera.orthographic(eye=(0, 0, 20), target=(0, 0, 0), height=8.0, near=1, far=40)
+    scene = dr.Scene(objects=[box, ground], lights=[light])
+    got = dr.render(scene, camera, dr.RenderSettings(height=8, width=8, shading="flat"))
+    half = (got[3, 3] + got[0, 0]) / 2
+    sides = [got[2, 3:5], got[5, 3:5], got[3:5, 2]] + [got[3:5, 5]] * (direction[0] == 0)
+    np.testing.assert_allclose(np.stack(sides), np.tile(half, (len(sides), 2, 1)), atol=1e-3)
+
+
 def test_outlines_through_centres_of_pixels_bound_their_exact_area():
     """Of quads whose shadows have sides and corners there, on a floor whose diagonal is, too."""
     quads = np.array(

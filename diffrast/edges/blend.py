@@ -23,7 +23,7 @@ from diffrast.edges.records import Records, Start, no_records, with_lines, with_
 from diffrast.edges.rim import BESIDE
 from diffrast.edges.shadow_lines import Cast, Shadow, light_told
 from diffrast.edges.unseen import Survey
-from diffrast.edges.visibility import BACKGROUND, Seen
+from diffrast.edges.visibility import BACKGROUND, SNAPPED, Seen
 
 LEFT_STEPS = 256  # to a pixel's area: `Sums.left` is kept in two bytes a pixel
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
@@ -165,7 +165,8 @@ def _told(
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
     only that it is dark beyond, and that it is lit where the pixel's centre shows what is there:
     the colour that the area loses is the centre's, however narrow a strip lies in the dark. Where
-    an outline may cross a crease, both sides have the light of the pixel's centre. Of points whose
+    an outline may cross a crease, both sides have the light of the pixel's centre, and so has what
+    lies beyond a fold through the centre, where the outline may be the same line. Of points whose
     colours are not used no light is asked.
     """
     if view.cast is None:
@@ -179,6 +180,8 @@ def _told(
     shown = found.front.is_centre | found.beyond.is_centre
     crossed = ~found.fold & shown & (front < 0) & (beyond < 0)
     front, beyond = jnp.where(crossed, here, jnp.stack([front, beyond]))
+    on_edge = found.fold & found.beyond.is_centre & (jnp.abs(found.centre_depth) < SNAPPED)
+    beyond = jnp.where(on_edge & (beyond < 0), here, beyond)
     front = jnp.where(found.fold, -1, front)
     asked = found.fold & ~found.beyond.is_centre
     beyond = jnp.where(asked & (beyond > 0), -1, beyond)

@@ -51,7 +51,7 @@ from diffrast.edges.unseen import Unseen
 from diffrast.edges.ways import LOOK, Spot, inwards, outwards, sides_of, walked
 from diffrast.raster.fixed_point import subpixel_bits
 
-_SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
+SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
 _BY = 1 / 16  # pixels: vertices so near a centre lie where the rasteriser has them
 _TIE = (2.0**-12, 2.0**-17)  # pixels to the right and down: less than the rasteriser's steps
 _FINE = 1.0  # square pixels: faces of half this area may hide others that no pixel shows
@@ -225,7 +225,7 @@ def look(
     wrong_side = fold & (pictured[4] >= 0) & (pictured[4] == other)
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
-    close = (jnp.abs(to_right) < _SNAPPED) & (is_beyond != 0)
+    close = (jnp.abs(to_right) < SNAPPED) & (is_beyond != 0)
     least = jnp.array(_TIE[1], near.dtype)
     told = (outward * is_beyond).astype(near.dtype)  # the sign of `to_right`
     # Of an edge that ends before the centre the one beyond its corner tells.
