@@ -63,6 +63,7 @@ ORDER = [
     "diffrast.edges.piercing",
     "diffrast.edges.shadow_planes",
     "diffrast.edges.shadow_ends",
+    "diffrast.edges.shadow_overlap",
     "diffrast.edges.shadow_lines",
     "diffrast.edges.records",
     "diffrast.edges.blend",

@@ -158,8 +158,8 @@ def _on_faces(
 
 
 def _told(
-    view: View, pixel: Int[Array, "2 n"], found: Seen, points: int
-) -> Int[Array, "lights points"] | None:
+    view: View, cast: Cast, pixel: Int[Array, "2 n"], found: Seen, points: int
+) -> tuple[Int[Array, "lights points"], tuple[Bool[Array, " n"], Bool[Array, " n"]]]:
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
@@ -168,15 +168,15 @@ def _told(
     an outline may cross a crease, both sides have the light of the pixel's centre, and so has what
     lies beyond a fold through the centre, where the outline may be the same line. Of points whose
     colours are not used no light is asked.
+
+    Also beyond which folds no pixel shows a shadow: it may begin there, but ends not far away; and
+    in front of which some do, and others do not: it is not the shading that changes there.
     """
-    if view.cast is None:
-        return None
-    front, beyond = (
-        light_told(view.cast, view.face_image, pixel, side.face)
-        for side in (found.front, found.beyond)
+    (front, in_front), (beyond, around) = (
+        light_told(cast, view.face_image, pixel, side.face) for side in (found.front, found.beyond)
     )
     column, row = pixel + 1
-    here = view.cast.lit[:, row, column].astype(front.dtype)
+    here = cast.lit[:, row, column].astype(front.dtype)
     shown = found.front.is_centre | found.beyond.is_centre
     crossed = ~found.fold & shown & (front < 0) & (beyond < 0)
     front, beyond = jnp.where(crossed, here, jnp.stack([front, beyond]))
@@ -186,8 +186,9 @@ def _told(
     asked = found.fold & ~found.beyond.is_centre
     beyond = jnp.where(asked & (beyond > 0), -1, beyond)
     inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
-    told = [front, beyond] + [inwards] * (points - 2)
-    return jnp.concatenate([jnp.where(found.visible, part, 0) for part in told], axis=1)
+    parts = [front, beyond] + [inwards] * (points - 2)
+    told = jnp.concatenate([jnp.where(found.visible, part, 0) for part in parts], axis=1)
+    return told, stored((asked & jnp.any(around > 0, axis=0), jnp.any(in_front == -1, axis=0)))
 
 
 def with_pieces(
@@ -218,16 +219,21 @@ def with_pieces(
     across = found.end - found.begin
     area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
-    smooth = jnp.zeros_like(found.visible)
+    smooth = rim.smooth & (method.shader is not None)
     if method.shader is None:
         jump = behind - front
         value = area * jump
     else:
-        points = found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside
-        told = _told(view, pieces.pixel, found, len(points))
+        points = [found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside]
+        told = None
+        if view.cast is not None and found.half_way is not None:
+            told, (lit_around, parted) = _told(view, view.cast, pieces.pixel, found, len(points))
+            smooth = smooth & ~parted
+            face, at_edge = points[1]
+            ways = zip(found.half_way, at_edge, strict=True)
+            points[1] = face, [jnp.where(lit_around, *way) for way in ways]
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
-        smooth = rim.smooth
         integral, moved = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
         if method.capacity:  # what is inwards of a thin face moves with its inner edge
@@ -278,8 +284,10 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
         told = None
         if view.cast is not None:
-            unknown = jnp.where(line.used, -1, 0)
-            told = jnp.tile(unknown, (view.cast.weight.size, 2))
+            told, lit_around = _lit_by_pixels(view, view.cast, line)
+            for i, (face, on_line) in enumerate(points):
+                ways = zip([b[i] for b in line.half_way], on_line, strict=True)
+                points[i] = face, [jnp.where(lit_around[i], *way) for way in ways]
         right, left = _shade(view, method, told, *points)
     jump = stored(right - left)
     value = area * jump
@@ -290,6 +298,23 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
     use = jnp.stack([line.used] * 3)
     records = with_lines(total.records, use, own, places, jump.T, area, corners, motion)
     return Blended(records, sums)
+
+
+def _lit_by_pixels(
+    view: View, cast: Cast, line: Line
+) -> tuple[Int[Array, "lights points"], list[Bool[Array, " n"]]]:
+    """What pixels tell of the light on both sides: of what the centre shows, and that it is dark.
+
+    On the line itself a shadow may begin that is all but out of sight. Also on which sides no pixel
+    shows one.
+    """
+    told, lit_around = [], []
+    for look, face in zip(line.look, line.face, strict=True):
+        _, around = light_told(cast, view.face_image, line.pixel, face)
+        asked = (look != 4) & (around > 0)
+        told.append(jnp.where(line.used, jnp.maximum(jnp.where(asked, -1, around), -1), 0))
+        lit_around.append(stored(jnp.any(asked, axis=0)))
+    return jnp.concatenate(told, axis=1), lit_around
 
 
 def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Blended:

@@ -104,7 +104,15 @@ def _edges(
         def add_pieces(state: tuple[Array, Waiting, Blended]) -> tuple[Array, Waiting, Blended]:
             n, waiting = edges.until_enough(segments, ends, cuts, *state[:2])
             pieces = first_ones(waiting, edges.at_once)
-            found, left = look(pieces, segments, surface, view.face_image, near_bare, unseen)
+            found, left = look(
+                pieces,
+                segments,
+                surface,
+                view.face_image,
+                near_bare,
+                unseen,
+                shadowed=view.cast is not None,
+            )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total
 
@@ -164,7 +172,8 @@ def _shadows(view: View, cast: Cast, method: Method, surface: Surface) -> Work:
         outlines = cross_shadows(places, exists, cast, surface, view.face_image)
 
         def add_lines(line: Array, exists: Array, total: Blended) -> Blended:
-            return with_shadow(total, view, method, shadow_of(outlines, line, exists, view.faces))
+            lines = shadow_of(outlines, line, exists, cast, surface, view.face_image)
+            return with_shadow(total, view, method, lines)
 
         return over_batches(outlines.lines, outlines.total, shadows_at_once, add_lines, total)
 

@@ -39,6 +39,7 @@ from diffrast.edges.neighborhood import (
 )
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import ASIDE, TOLERANCE, Table, area, corners_of, room_in_pixel
+from diffrast.edges.rim import reach
 
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 128
@@ -87,7 +88,8 @@ class Line(NamedTuple):
     used: Bool[Array, " n"]
     look: Int[Array, "2 n"]  # 0 to 8: pixels that show the face in front on the right and left
     face: Int[Array, "2 n"]  # these faces,
-    barycentrics: list[Float[Array, "2 n"]]  # and where the line's middle lies on them
+    barycentrics: list[Float[Array, "2 n"]]  # and where the line's middle lies on them,
+    half_way: list[Float[Array, "2 n"]]  # and what lies half-way from there to the pixel's border
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
     motion: Float[Array, "2 3 3 n"]  # area on the right with faces' corners' x, y, w
@@ -363,9 +365,12 @@ def lines_of(
     used = used & ~_hidden(planes, ~own, x, y, depth[0])
 
     # Seen a little aside, where each is in front: on the line itself either may shade the other.
-    in_front = values + aside * jnp.array([[1], [-1]], aside.dtype)
+    to_front = jnp.array([[1], [-1]], aside.dtype)
+    in_front = values + aside * to_front
     in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
-    total = _added(in_front)
+    middle = stored(jnp.stack([x, y]))
+    half = jnp.stack([reach(middle, normal), reach(middle, -normal)]) / 2
+    half_way = jnp.maximum(values + aside * to_front * (half / _THROUGH), 0)
 
     centre = pixel.astype(depth.dtype) + 0.5
     plane = jnp.stack(
@@ -380,11 +385,18 @@ def lines_of(
         used=used,
         look=_where_shown(planes.face, face, both(planes.look), patches, x, y),
         face=face,
-        barycentrics=[value / jnp.where(total > 0, total, 1) for value in in_front],
+        barycentrics=_shares(in_front),
+        half_way=_shares(half_way),
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
     )
+
+
+def _shares(values: Array) -> list[Array]:
+    """Of three values in their sum."""
+    total = _added(values)
+    return [value / jnp.where(total > 0, total, 1) for value in values]
 
 
 def _where_shown(

@@ -41,13 +41,12 @@ def next_inwards(
     middle: Float[Array, "2 n"], inward: Float[Array, "2 n"]
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """How far a pixel reaches from points inwards, and which of the 3×3 is next: see `Rim`."""
-    depth = _reach(middle, inward)
+    depth = reach(middle, inward)
     return depth, stored(pixel_at(middle, inward, depth + 0.5))
 
 
-def _reach(
-    point: Float[Array, "2 *size"], inward: Float[Array, "2 *size"]
-) -> Float[Array, "*size"]:
+def reach(point: Float[Array, "2 *size"], inward: Float[Array, "2 *size"]) -> Float[Array, "*size"]:
+    """How far a pixel reaches from points in it, in these directions; no farther than 1.5."""
     exits = [
         (0.5 - jnp.sign(way) * at) / jnp.maximum(abs(way), _SMALL)
         for way, at in zip(inward, point, strict=True)
@@ -107,7 +106,7 @@ def look_inwards(
     return Rim(
         smooth=(front >= 0) & connected & goes_on,
         inner=inner,
-        reaches=jnp.stack([_reach(middle + way * across, inward) for way in _EIGHTHS]),
+        reaches=jnp.stack([reach(middle + way * across, inward) for way in _EIGHTHS]),
         depth=depth,
         first=first,
         thin=(thickness < jnp.minimum(depth, _THIN)) & (long > _LONG) & (next_face != front),

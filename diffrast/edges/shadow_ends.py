@@ -9,7 +9,8 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from diffrast._stored import stored
-from diffrast.edges.planes import ASIDE, dot_rows, largest
+from diffrast.edges.pieces import positive_part
+from diffrast.edges.planes import ASIDE, TOLERANCE, dot_rows, edge_values, largest
 from diffrast.edges.shadow_planes import Plane
 
 ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
@@ -18,6 +19,7 @@ _TOUCHES = 1e-4  # of its size: how far from the plane of a face an edge may end
 _STEEP = 1e-3  # of its size: how far an edge at least goes into the plane of a face
 _BLUNT = 0.05  # cosine: of sharper corners the sides are moved less far than that takes
 _FLAT = 0.1  # pixels: how far lines on faces that count as one plane may be apart
+_GAP = 1e-3  # of a line: how far faces that cover it may be apart
 _ONE_LINE = 1e-3  # pixels: how far lines on two faces that are one may be apart
 
 
@@ -106,6 +108,38 @@ def past_centre(
     gained = jnp.maximum(dot_rows(outwards, way[:, None, None]), _BLUNT)
     lacking = jnp.where(passed, (ASIDE - side * beyond) / gained, 0)
     return stored(side * jnp.clip(jnp.max(lacking, axis=(0, 1)), 0, 2 * ROUNDED) * way)
+
+
+def uncovered(
+    begin: Float[Array, "3 n"],
+    end: Float[Array, "3 n"],
+    corners: Float[Array, "3 3 faces n"],
+    hides: Bool[Array, "faces n"],
+) -> tuple[Array, Array]:
+    """What parts of lines, from 0 to 1, faces nearer to the eye leave that cover their ends.
+
+    Args:
+        begin: x and y from the pixel's centre, and 1/w.
+        end: likewise.
+        corners: of the faces.
+        hides: which of them count.
+    """
+    zero = jnp.zeros_like(begin[0])
+
+    def inside(point: Array) -> list[Array]:
+        x, y, nearness = point
+        values, depth = edge_values(corners, x[None], y[None], near=(zero, zero))
+        return [*values, stored(depth - nearness * (1 + TOLERANCE))]
+
+    first, last = positive_part(inside(begin), inside(end))
+    hides = hides & (first < last)
+    low, high = zero, zero + 1
+    for _ in range(2):  # where one face ends another one may go on
+        low = jnp.maximum(low, jnp.max(jnp.where(hides & (first <= low + _GAP), last, 0), axis=0))
+        high = jnp.minimum(
+            high, jnp.min(jnp.where(hides & (last >= high - _GAP), first, 1), axis=0)
+        )
+    return stored((low, high))
 
 
 def same_place(end: Array, others: list[Array]) -> Array:

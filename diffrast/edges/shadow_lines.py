@@ -27,6 +27,7 @@ from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
     barycentrics,
+    corners_of,
     dot_rows,
     edge_functions,
     edge_values,
@@ -41,7 +42,9 @@ from diffrast.edges.shadow_ends import (
     enter,
     past_centre,
     same_place,
+    uncovered,
 )
+from diffrast.edges.shadow_overlap import Lines, left_by_others, overlap
 from diffrast.edges.shadow_planes import (
     Plane,
     behind_edge,
@@ -57,13 +60,11 @@ from diffrast.edges.shadow_planes import (
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
-_CROSS = _NEAREST[:5]  # and of them the middle one, and the four next to it
-_CERTAIN = 8  # times as much as another one tells the middle one where outlines end
+_CROSS = 5  # of which the first so many are the middle one and the four next to it
 _EDGES = 4  # whose shadows part a pixel, at most,
 _FACES = 4  # on so many faces
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
-_OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
 
 # Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
 _RIGHT = [(0, 3 * row + k, 3 * row + k + 1) for row, k in itertools.product(range(3), range(2))]
@@ -101,6 +102,7 @@ class Outlines(NamedTuple):
     places: Places
     face: Int[Array, "faces n"]  # on which the shadows fall
     corners: Float[Array, "3 3 faces n"]  # of them, from the pixel's centre
+    edge: Int[Array, "edges n"]  # 3 * face + corner, as in `Cast`
     vertices: Int[Array, "2 edges n"]
     ends: Float[Array, "2 3 edges n"]  # of the edges, from the pixel's centre
     source: Float[Array, "3 n"]  # the light, likewise
@@ -167,12 +169,9 @@ def cross_shadows(
     """Find the lines at these places: of each edge on each face on which its shadow may fall."""
     light, rows, pixel = places
     faces, pixels, topology, _ = surface
-    centre = pixel.astype(pixels.dtype) + 0.5
 
     def place(vertex: Array) -> Array:
-        """x, y and w of vertices, from the pixel's centre."""
-        x, y, w = pixels[:, vertex]
-        return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
+        return _from_centre(pixels[:, vertex], pixel)
 
     # The faces round the pixel and beside its own, and those of its surface that are turned to the
     # light.
@@ -217,6 +216,11 @@ def cross_shadows(
     ground, shadow = face_plane(corners), shadow_plane(source[:, None], weight, *ends)
     tip = place(faces[caster, third])
     above = dot_rows(shadow.normal, tip) + shadow.offset
+    # Twice as far as from the other end of those that it has a vertex in common with.
+    from_edges = [
+        dot_rows(shadow.normal[:, :, None], end[:, None]) + shadow.offset[:, None] for end in ends
+    ]
+    on_dark_side = stored((from_edges[0] + from_edges[1]) * above[:, None] > 0)
     ends_of = [end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
     behind = behind_edge(source[:, None], weight, shadow, *ends)
     ground = Plane(ground.normal[:, None], ground.offset[None])
@@ -241,32 +245,20 @@ def cross_shadows(
     valid = found & jnp.any(of_pair & received & passes, axis=1)
     usable = valid[:, None] & received & (inverse > 0)
 
-    # Outlines of one shadow go on in the next edge; others pass on the other side of a shadow.
+    # Outlines of one shadow go on in the next edge.
     meets = [same_place(end, ends) & valid[:, None] & valid for end in ends]
     linked = meets[0] | meets[1]
-    primary = valid & (jnp.arange(_EDGES, dtype=jnp.int32)[:, None] == first_row(valid))
-    chain = primary
-    for _ in range(2):
-        chain = chain | jnp.any(linked & chain, axis=1)
-    along_first = jnp.sum(jnp.where(primary, outwards[:, :, 0], 0), axis=1)
-    chosen = chain | (valid & (dot_rows(outwards[:, :, 0], along_first[:, None]) < _OPPOSITE))
-
-    # Outlines that are not linked end at each other: those of several shadows where all of them let
-    # the light pass, at the corner of one shadow where the other one does not.
-    told = (
-        dot_rows(outwards[:, None, :, 0], steps_to(jnp.arange(9))[..., None, None]) > beyond[:, 0]
+    body = jnp.zeros_like(caster) if topology.bodies is None else topology.bodies[caster]
+    lines = Lines(
+        outwards=outwards[:, :, 0],
+        beyond=beyond[:, 0],
+        valid=valid,
+        linked=linked,
+        corner=linked & on_dark_side,
+        alike=(body[:, None] == body) & valid[:, None] & valid,
     )
-    both = jnp.all(told | ~valid, axis=1)
-    either = jnp.any(told & valid, axis=1)
-    certain = jnp.where((jnp.arange(9)[:, None] == 4) & is_own[0], _CERTAIN, 1)
-    wrong = [
-        jnp.sum(((one != lit) & counts).astype(certain.dtype) * certain, axis=0)
-        for one in (both, either)
-    ]
-    decided = jnp.any(valid & ~chain, axis=0) & (wrong[0] != wrong[1])
-    chosen = jnp.where(decided, valid, chosen)
-    ends_others = decided & valid[:, None] & valid & (chain[:, None] != chain)
-    side = jnp.where(wrong[0] < wrong[1], 1, -1)
+    shared = overlap(lines, lit, counts, is_own[0])
+    chosen = shared.chosen
 
     along = REACH * jnp.stack([-normal[1], normal[0]])
     limits = [meeting(ground, plane) for plane in (*ends_of, behind)]
@@ -278,15 +270,12 @@ def cross_shadows(
             jnp.where(is_cut, a * x + b * y + c, 1)
             for is_cut, (a, b, c) in zip(cut, limits, strict=True)
         ]
-        others = [
-            jnp.where(ends_others[:, k, None], side * (way[0] * x + way[1] * y - least), 1)
-            for k, (way, least) in enumerate(zip(outwards.swapaxes(0, 1), beyond, strict=True))
-        ]
-        return room_in_pixel(x, y) + ends_here + others
+        return room_in_pixel(x, y) + ends_here
 
     zero = jnp.zeros_like(source[0])
     both_ends = foot - along, foot + along
     in_pixel = positive_part(*map(inside, both_ends))
+    in_pixel = common(in_pixel, left_by_others(shared, outwards, beyond, both_ends))
     values = [edge_values(corners[:, :, None], x, y, near=(zero, zero))[0] for x, y in both_ends]
     _, goes_on = beside(ground_face)
     ends_there = [
@@ -301,11 +290,12 @@ def cross_shadows(
     alone = counts[4] & (jnp.sum(drawn, axis=(0, 1)) == 1)
     passed = alone | ((range_[0] < ROUNDED) & (range_[1] > -ROUNDED))
     passed = drawn & counts[4] & passed & (jnp.abs(beyond) < ROUNDED)
-    lines, total = selected(drawn.reshape(_EDGES * _FACES, -1))
+    drawn_lines, total = selected(drawn.reshape(_EDGES * _FACES, -1))
     return Outlines(
         places=places,
         face=ground_face,
         corners=corners,
+        edge=edge,
         vertices=vertices,
         ends=jnp.stack(ends),
         source=source,
@@ -316,7 +306,7 @@ def cross_shadows(
         alone=alone,
         shift=past_centre(outwards, beyond, passed, lit[4]),
         range=range_,
-        lines=lines,
+        lines=drawn_lines,
         total=total,
     )
 
@@ -339,9 +329,12 @@ def shadow_of(
     outlines: Outlines,
     line: Int[Array, " n"],
     exists: Bool[Array, " n"],
-    faces: Int[Array, "F 3"],
+    cast: Cast,
+    surface: Surface,
+    face_image: Int[Array, "height_with_border width_with_border"],
 ) -> Shadow:
     """These lines, and how they move."""
+    faces = surface.faces
     row, place = divided(line, outlines.weight.size)
     edge, column = divided(row, _FACES)
 
@@ -367,6 +360,13 @@ def shadow_of(
     foot = foot + stored(outlines.shift[:, place])
     along = jnp.stack([-normal[1], normal[0]])
     low, high = stored_together((one(outlines.range[0]), one(outlines.range[1])))
+
+    whole = foot + low * along, foot + high * along
+    at, hides = _before(pixel, of_edge(outlines.edge), face, cast, surface, face_image)
+    first, last = (stored(jnp.stack([*point, _nearness(ground, *point)])) for point in whole)
+    bare = uncovered(first, last, at, hides)
+    low, high = stored_together([low + part * (high - low) for part in bare])
+    exists = exists & (low < high)
     x, y = middle = foot + (low + high) / 2 * along
     lit_on_right = one(outlines.lit_on_right)
     centre_on_right = dot_rows(foot, normal) < 0
@@ -375,18 +375,17 @@ def shadow_of(
 
     # The middle as a sum of light, start and end, and as one of the face's corners.
     point = jnp.stack([x, y, jnp.ones_like(x)])
-    depth = -dot_rows(ground.normal, point) / nonzero(ground.offset)
+    depth = _nearness(ground, x, y)
     planes = [
         end_plane(source, weight, shadow, end, start),
         end_plane(source, weight, shadow, start, end),
         edge_plane(shadow, start, end),
     ]
-    to_light = source - weight * start
-    at = [start - end, end - start, to_light]
+    ways = [start - end, end - start, source - weight * start]
     shares = [
         (dot_rows(plane.normal, point) + plane.offset * depth)
         / nonzero(dot_rows(plane.normal, away))
-        for plane, away in zip(planes, at, strict=True)
+        for plane, away in zip(planes, ways, strict=True)
     ]
     e, volume = edge_functions(corners, x, y)
     per_plane = (high - low) * inverse
@@ -424,21 +423,60 @@ def light_told(
     face_image: Int[Array, "height_with_border width_with_border"],
     pixel: Int[Array, "2 n"],
     face: Int[Array, " n"],
-) -> Int[Array, "lights n"]:
+) -> tuple[Int[Array, "lights n"], Int[Array, "lights n"]]:
     """Whether lights reach faces at pixels, as far as these and the four next to them tell.
 
     1 or 0 where all those agree that show the same surface, turned to the light; else -1. Between
-    them no outline is known, so a ray to the light would tell of a strip that no centre shows.
+    them no outline is known, so a ray to the light would tell of a strip that no centre shows. Also
+    what all of the 3×3 pixels tell, -2 where none of these shows it so.
     """
-    column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(_CROSS))[..., None]
+    column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(_NEAREST))[..., None]
     shown = stored(face_image[row, column])
     seen, face = jnp.maximum(shown, 0), jnp.maximum(face, 0)
     same = (shown >= 0) & (cast.patches[seen] == cast.patches[face])
     counts = same & cast.turned[:, seen]
     lit = cast.lit[:, row, column]
-    bright, dark = jnp.any(counts & lit, axis=1), jnp.any(counts & ~lit, axis=1)
-    told = jnp.where(bright == dark, -1, jnp.where(bright, 1, 0))
-    return stored(jnp.where(cast.turned[:, face], told, 0))
+
+    def told(rows: int) -> Array:
+        bright, dark = (jnp.any((counts & part)[:, :rows], axis=1) for part in (lit, ~lit))
+        alike = jnp.where(bright, jnp.where(dark, -1, 1), jnp.where(dark, 0, -2))
+        return jnp.where(cast.turned[:, face], alike, 0)
+
+    return stored((jnp.maximum(told(_CROSS), -1), told(len(_NEAREST))))
+
+
+def _before(
+    pixel: Int[Array, "2 n"],
+    edge: Int[Array, " n"],
+    face: Int[Array, " n"],
+    cast: Cast,
+    surface: Surface,
+    face_image: Int[Array, "height_with_border width_with_border"],
+) -> tuple[Float[Array, "3 3 faces n"], Bool[Array, "faces n"]]:
+    """Corners of faces that may hide the shadows of edges on other faces, and which of them do.
+
+    What is seen at the 3×3 pixels, but for the surface of the other face, and what is at the edges.
+    """
+    faces, pixels, topology, volume = surface
+    caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    at_edge = jnp.stack([caster, topology.neighbors[caster, third]])
+    others = jnp.concatenate([stored(pixels_round(face_image, *pixel)), at_edge])
+    there = jnp.maximum(others, 0)
+    hides = (others >= 0) & (volume[there] != 0) & (cast.patches[there] != cast.patches[face])
+    return _from_centre(corners_of(others, faces, pixels), pixel), stored(hides)
+
+
+def _from_centre(vertices: Array, pixel: Int[Array, "2 n"]) -> Array:
+    """x, y and w of vertices on the screen, from pixels' centres."""
+    x, y, w = vertices
+    centre = pixel.astype(w.dtype) + 0.5
+    return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
+
+
+def _nearness(plane: Plane, x: Array, y: Array) -> Array:
+    """1/w of a face's plane at points of the screen."""
+    normal = plane.normal
+    return -(normal[0] * x + normal[1] * y + normal[2]) / nonzero(plane.offset)
 
 
 def _of_screen(motion: Array, pixel: Array) -> Array:

@@ -11,6 +11,7 @@ their faces does, or that both end before. Where only one is seen, the second ma
 centre shows.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -46,9 +47,9 @@ from diffrast.edges.planes import (
     edge_values,
     inverse_depth_slope,
 )
-from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards
+from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards, reach
 from diffrast.edges.unseen import Unseen
-from diffrast.edges.ways import LOOK, Spot, inwards, outwards, sides_of, walked
+from diffrast.edges.ways import LOOK, Spot, inwards, located, outwards, sides_of, walked
 from diffrast.raster.fixed_point import subpixel_bits
 
 SNAPPED = 2e-3  # pixels: more than edges move by the rounding of vertices in the rasteriser
@@ -87,9 +88,11 @@ class Seen(NamedTuple):
     begin: Float[Array, "2 n"]  # ends of the part, from the pixel's centre
     end: Float[Array, "2 n"]
     middle: Float[Array, " n"]  # of the part on the clipped edge, as seen on the screen
+    # Of what is beyond, half-way from there to where the pixel ends; None without shadows.
+    half_way: Columns | None
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="shadowed")
 def look(
     pieces: Pieces,
     segments: Segments,
@@ -97,10 +100,13 @@ def look(
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
     unseen: Unseen,
+    *,
+    shadowed: bool,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `face_image` has a border of one pixel all round; `near_bare` is its `near_background`.
+    `shadowed` is whether lights cast shadows.
     """
     faces, pixels, topology, volume = surface
     own, own_corners, weights, *ends, fold, first_on_right = stored_together(
@@ -287,6 +293,10 @@ def look(
     beyond = jnp.where(walks.behind >= 0, walks.behind, beyond)
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
     beside = sides_of(jnp.stack([front, beyond]), walks, surface)
+    half_way = None
+    if shadowed:
+        at = centre + middle + reach(middle, out) / 2 * out
+        half_way = located(beyond, at, surface)
     bare = pictured < 0
     bare_look = first_row(bare)
     bare_look = jnp.where(bare_look < 9, bare_look, front_look)
@@ -334,6 +344,7 @@ def look(
         begin=begin,
         end=end,
         middle=t,
+        half_way=half_way,
     )
     return stored_together(seen), left
 

@@ -198,8 +198,12 @@ def sides_of(faces: Int[Array, "2 n"], found: Walked, surface: Surface) -> Colum
 
     On the edge itself rounding would decide whether a face that ends there shades it.
     """
-    x, y = jnp.stack([found.inside, found.beyond], axis=1)
-    values, _ = edge_values(corners_of(faces, surface.faces, surface.pixels), x, y)
+    return located(faces, jnp.stack([found.inside, found.beyond], axis=1), surface)
+
+
+def located(face: Array, point: Array, surface: Surface) -> Columns:
+    """Barycentric coordinates of points (x, y) on the screen, or of what faces have near them."""
+    values, _ = edge_values(corners_of(face, surface.faces, surface.pixels), *point)
     return barycentrics([jnp.maximum(value, 0) for value in values])
 
 
