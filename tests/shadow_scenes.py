@@ -95,3 +95,27 @@ SCENES = {  # objects, light, camera
 def make(name):
     objects, light, camera = SCENES[name]()
     return dr.Scene(objects=objects, lights=[light]), camera
+
+
+def at_random(seed):
+    """Two boxes and a ball over a floor, some of which pierce one another, and a lamp."""
+    random = np.random.default_rng(seed)
+
+    def box():
+        size = random.uniform(0.25, 0.8)
+        turn = linalg.rotation_y(random.uniform(0, 6))
+        turn = turn @ linalg.scaling(size * np.append(1, random.uniform(0.5, 1.5, 2)))
+        height = -1 + 1.6 * size if random.random() < 0.5 else random.uniform(-0.6, 1)
+        color = dr.Material(diffuse=random.uniform(0.3, 0.9, 3))
+        place = (random.uniform(-1.5, 1.5), height, random.uniform(-1.5, 1.5))
+        return dr.Object(shapes.cube(), color, linalg.translation(place) @ turn)
+
+    sphere = shapes.icosphere(2, random.uniform(0.3, 0.8))
+    place = linalg.translation(random.uniform(-1.2, 1.2, 3))
+    things = [box(), box(), dr.Object(sphere, dr.Material(diffuse=(0.7, 0.6, 0.5)), place), floor()]
+    light = lamp(random.uniform((-3, 3, -3), (3, 6, 3)), resolution=256)
+    around, up = random.uniform(0, 2 * np.pi), random.uniform(0.4, 1.2)
+    eye = (7 * np.cos(around) * np.cos(up), 7 * np.sin(up), 7 * np.sin(around) * np.cos(up))
+    target = random.uniform(-0.3, 0.3, 3)
+    camera = dr.Camera.perspective(eye=eye, target=target, **(FRAME | {"fov_y": 0.6}))
+    return dr.Scene(objects=things, lights=[light]), camera

@@ -219,11 +219,12 @@ def with_pieces(
     across = found.end - found.begin
     area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
-    smooth = rim.smooth & (method.shader is not None)
+    smooth = jnp.zeros_like(found.visible)
     if method.shader is None:
         jump = behind - front
         value = area * jump
     else:
+        smooth = rim.smooth
         points = [found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside]
         told = None
         if view.cast is not None and found.half_way is not None:
@@ -283,7 +284,7 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
     else:
         points = [(line.face[i], [b[i] for b in line.barycentrics]) for i in range(2)]
         told = None
-        if view.cast is not None:
+        if view.cast is not None and line.half_way is not None:
             told, lit_around = _lit_by_pixels(view, view.cast, line)
             for i, (face, on_line) in enumerate(points):
                 ways = zip([b[i] for b in line.half_way], on_line, strict=True)

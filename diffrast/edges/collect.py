@@ -147,7 +147,9 @@ def _piercing(view: View, method: Method, surface: Surface) -> Work:
         )
 
         def add_lines(pair: Array, exists: Array, total: Blended) -> Blended:
-            lines = lines_of(crossings, pair, exists, view.topology.patches)
+            shadowed = view.cast is not None
+            patches = view.topology.patches
+            lines = lines_of(crossings, pair, exists, patches, shadowed=shadowed)
             return with_line(total, view, method, lines)
 
         return over_batches(crossings.pairs, crossings.total, lines_at_once, add_lines, total)

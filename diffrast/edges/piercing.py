@@ -15,6 +15,7 @@ and positive on the face, and 1/w is their sum. For the plane c, c · p = 1/w, a
 corner; so where a corner moves by dV, 1/w changes at a fixed point by −λ c · dV.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -89,7 +90,8 @@ class Line(NamedTuple):
     look: Int[Array, "2 n"]  # 0 to 8: pixels that show the face in front on the right and left
     face: Int[Array, "2 n"]  # these faces,
     barycentrics: list[Float[Array, "2 n"]]  # and where the line's middle lies on them,
-    half_way: list[Float[Array, "2 n"]]  # and what lies half-way from there to the pixel's border
+    # and what lies half-way from there to the pixel's border; None without shadows
+    half_way: list[Float[Array, "2 n"]] | None
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
     motion: Float[Array, "2 3 3 n"]  # area on the right with faces' corners' x, y, w
@@ -315,14 +317,19 @@ def _left_of(normal: Array) -> Array:
     return jnp.stack([-normal[1], normal[0]])
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="shadowed")
 def lines_of(
     crossings: Crossings,
     pair: Int[Array, " n"],
     exists: Bool[Array, " n"],
     patches: Int[Array, " F"],
+    *,
+    shadowed: bool,
 ) -> Line:
-    """The lines along which these pairs of faces pierce each other, where they are visible."""
+    """The lines along which these pairs of faces pierce each other, where they are visible.
+
+    `shadowed` is whether lights cast shadows.
+    """
     both_faces, place = divided(pair, crossings.unit.size)
     one, other = divided(both_faces, _FACES)
     pixel, planes = stored_together(
@@ -368,9 +375,11 @@ def lines_of(
     to_front = jnp.array([[1], [-1]], aside.dtype)
     in_front = values + aside * to_front
     in_front = jnp.where(whole, jnp.maximum(in_front, 0), in_front)
-    middle = stored(jnp.stack([x, y]))
-    half = jnp.stack([reach(middle, normal), reach(middle, -normal)]) / 2
-    half_way = jnp.maximum(values + aside * to_front * (half / _THROUGH), 0)
+    half_way = None
+    if shadowed:
+        middle = stored(jnp.stack([x, y]))
+        half = jnp.stack([reach(middle, normal), reach(middle, -normal)]) / 2
+        half_way = _shares(jnp.maximum(values + aside * to_front * (half / _THROUGH), 0))
 
     centre = pixel.astype(depth.dtype) + 0.5
     plane = jnp.stack(
@@ -386,7 +395,7 @@ def lines_of(
         look=_where_shown(planes.face, face, both(planes.look), patches, x, y),
         face=face,
         barycentrics=_shares(in_front),
-        half_way=_shares(half_way),
+        half_way=half_way,
         begin=begin,
         end=end,
         motion=jnp.where(used, motion.transpose(2, 0, 1, 3), 0),
