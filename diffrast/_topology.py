@@ -6,6 +6,7 @@ checks the arguments, converts between JAX and NumPy, and is the public face of 
 """
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast import _check
 
-SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
+_SAME_NORMAL = 1e-5  # of their size: normals on both sides of a seam that need no edge
 
 
 class EdgeAdjacency(NamedTuple):
@@ -180,7 +181,7 @@ def topology_of(
     bodies = _joined(welded[faces], len(positions))
     whole = bool(np.all(bodies == bodies[0]))
     alike = np.zeros((0, 3), int)
-    if attributes is not None:
+    if attributes is not None and np.any(seam):
         alike = _alike(positions, faces, edges, attributes)
     patches = _joined(np.concatenate([faces, alike]), len(positions))[: len(faces)]
     return Topology(edges, neighbors, patches, None if whole else bodies)
@@ -194,20 +195,38 @@ def _alike(
     Vertices without normals have those of their faces.
     """
     normals, uvs = attributes
-    seams = np.flatnonzero(edges.seam)
-    beside = faces[edges.faces[seams]]
-    one, other = (
-        np.take_along_axis(beside[:, side], np.stack(divmod(edges.corners[seams, side], 3), 1), 1)
-        for side in range(2)
-    )
     if normals is None:
         normals = _smooth_normals(positions, faces)
-    size = np.max(np.abs(normals), axis=1)
-    apart = np.max(np.abs(normals[one] - normals[other]), axis=2)
-    alike = np.all(apart <= SAME_NORMAL * (size[one] + size[other]), axis=1)
+    alike = edges.seam & ~bent_seams(edges, normals, faces)
+    one, other = np.moveaxis(_at_ends(edges, faces), -1, 0)
     if uvs is not None:
-        alike &= np.all(uvs[one] == uvs[other], axis=(1, 2))
-    return np.stack([one[alike, 0], other[alike, 0], one[alike, 1]], axis=1)
+        alike &= np.all(uvs[one] == uvs[other], axis=(0, 2))
+    return np.stack([one[0], other[0], one[1]], axis=1)[alike]
+
+
+def bent_seams(edges: Edges, normals: Any, faces: Any, xp: Any = np) -> Any:
+    """Those seams on whose sides the normals at the same place differ.
+
+    Args:
+        edges: of the faces.
+        normals: shape (vertices, 3), of the size of one.
+        faces: three vertex ids each.
+        xp: `numpy`, or `jax.numpy` for arrays that are being traced.
+    """
+    vertex = _at_ends(edges, faces, xp)
+    one, other = xp.moveaxis(normals.T[:, vertex], -1, 0)
+
+    def largest(vectors: Any) -> Any:
+        return reduce(xp.maximum, [abs(row) for row in vectors])
+
+    apart = largest(one - other) > _SAME_NORMAL * (largest(one) + largest(other))
+    return edges.seam & xp.any(apart, axis=0)
+
+
+def _at_ends(edges: Edges, faces: Any, xp: Any = np) -> Any:
+    """Vertices that the two faces of edges have at their ends, shape (2 ends, edges, 2 faces)."""
+    corner = xp.stack([edges.corners // 3, edges.corners % 3])
+    return faces[xp.maximum(edges.faces, 0), corner]
 
 
 def _smooth_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -12,10 +12,9 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float, Int
 
 from diffrast._stored import stored, stored_rows
-from diffrast._topology import SAME_NORMAL, Edges, Topology, traced_topology
+from diffrast._topology import Edges, Topology, bent_seams, traced_topology
 from diffrast._varying import varying_zero
 from diffrast.camera import Camera, pivoted_matrix, world_to_clip
-from diffrast.edges.planes import largest
 from diffrast.interpolate import interpolate_columns
 from diffrast.light import Columns
 from diffrast.linalg import (
@@ -324,17 +323,9 @@ def apart_edges(geometry: Geometry, edges: Edges, shading: str) -> Array:
     if geometry.normals is None:
         return jnp.zeros_like(edges.seam)
     seams = edges, jax.lax.stop_gradient(geometry.normals), geometry.faces
-    return jax.lax.cond(jnp.any(edges.seam), _bent_seams, _no_seams, *seams)
+    bent = partial(bent_seams, xp=jnp)
+    return jax.lax.cond(jnp.any(edges.seam), bent, _no_seams, *seams)
 
 
 def _no_seams(edges: Edges, normals: Array, faces: Array) -> Array:
     return jnp.zeros_like(edges.seam) | (varying_zero((edges, normals, faces)) != 0)
-
-
-def _bent_seams(edges: Edges, normals: Array, faces: Array) -> Array:
-    """Those seams on whose sides the normals at the same place differ."""
-    corner = jnp.stack([edges.corners // 3, edges.corners % 3])  # (2 ends, E, 2 faces)
-    vertex = faces[jnp.maximum(edges.faces, 0), corner]
-    one, other = jnp.moveaxis(normals.T[:, vertex], -1, 0)  # (3, 2 ends, E) each
-    apart = largest(one - other) > SAME_NORMAL * (largest(one) + largest(other))
-    return edges.seam & jnp.any(apart, axis=0)

@@ -157,6 +157,11 @@ def _on_faces(
     return [part * inverse_total for part in barycentrics]
 
 
+def _where(chosen: Array, first: list[Array], second: list[Array]) -> list[Array]:
+    """The first of two barycentric coordinates where that is chosen, else the second."""
+    return [jnp.where(chosen, *both) for both in zip(first, second, strict=True)]
+
+
 def _told(
     view: View, cast: Cast, pixel: Int[Array, "2 n"], found: Seen, points: int
 ) -> tuple[Int[Array, "lights points"], tuple[Bool[Array, " n"], Bool[Array, " n"]]]:
@@ -230,9 +235,7 @@ def with_pieces(
         if view.cast is not None and found.half_way is not None:
             told, (lit_around, parted) = _told(view, view.cast, pieces.pixel, found, len(points))
             smooth = smooth & ~parted
-            face, at_edge = points[1]
-            ways = zip(found.half_way, at_edge, strict=True)
-            points[1] = face, [jnp.where(lit_around, *way) for way in ways]
+            points[1] = points[1][0], _where(lit_around, found.half_way, points[1][1])
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         integral, moved = _along(found, front, bend, far, near, inner, beside)
@@ -287,8 +290,8 @@ def with_line(total: Blended, view: View, method: Method, line: Line) -> Blended
         if view.cast is not None and line.half_way is not None:
             told, lit_around = _lit_by_pixels(view, view.cast, line)
             for i, (face, on_line) in enumerate(points):
-                ways = zip([b[i] for b in line.half_way], on_line, strict=True)
-                points[i] = face, [jnp.where(lit_around[i], *way) for way in ways]
+                half_way = [b[i] for b in line.half_way]
+                points[i] = face, _where(lit_around[i], half_way, on_line)
         right, left = _shade(view, method, told, *points)
     jump = stored(right - left)
     value = area * jump
