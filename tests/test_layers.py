@@ -24,6 +24,7 @@ ORDER = [
     "diffrast.opencv",
     "diffrast.camera",
     "diffrast._topology",
+    "diffrast._polygons",
     "diffrast.mesh.triangles",
     "diffrast.mesh.normals",
     "diffrast.mesh.assembly",

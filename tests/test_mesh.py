@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 
 from diffrast import _topology
 from diffrast import mesh as dm
-from diffrast._topology import clip_ears
+from diffrast._polygons import clip_ears
 from diffrast.linalg import compose, rotation_y, scaling, translation
 from diffrast.mesh import Mesh
 

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 
 from diffrast import _check
 from diffrast._check import ArrayInput
-from diffrast._topology import EdgeAdjacency, edge_adjacency, join_indices
+from diffrast._polygons import join_indices
+from diffrast._topology import EdgeAdjacency, edge_adjacency
 from diffrast.camera import Camera, check_single, world_to_clip
 from diffrast.linalg import normalize, transform_normals, transform_points
 from diffrast.lines.drawing import draw_lines, draw_lines_with_depth

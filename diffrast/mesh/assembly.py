@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from diffrast import _check, _topology
+from diffrast import _check, _polygons, _topology
 from diffrast._check import ArrayInput
 from diffrast._topology import Topology
 from diffrast.linalg import mirrors, normalize, transform_normals, transform_points
@@ -47,7 +47,7 @@ def from_polygons(
         raise ValueError("vertices: wanted known numbers, got a traced array")
     _check.one_of("weighting", weighting, ("uniform", "area"))
     positions = np.asarray(positions_device, dtype=np.float64)
-    corners, sizes = _topology.join_indices(polygons, len(positions))
+    corners, sizes = _polygons.join_indices(polygons, len(positions))
     try:
         group = np.zeros(len(sizes), dtype=int) if surfaces is None else np.asarray(surfaces)
     except ValueError as error:
@@ -58,8 +58,8 @@ def from_polygons(
             f" {group.shape}, dtype {group.dtype}"
         )
     group = group.astype(np.int64)  # next to which others would become floats
-    joined = _topology.join_polygons(positions, corners, sizes)
-    triangles = _topology.triangulate(positions, joined)
+    joined = _polygons.join_polygons(positions, corners, sizes)
+    triangles = _polygons.triangulate(positions, joined)
     # One vertex for every vertex id and surface that occur together.
     pairs, owner = np.unique(
         np.stack([joined.corner, group[joined.polygon]], axis=1), axis=0, return_inverse=True
