@@ -129,9 +129,10 @@ def _least(mean: Array) -> Array:
 
 def _places(image: Array) -> int:
     """For how many pixels of an image there is room."""
-    most = -(-image.size // _SHARE)
-    unit = PARTS_AT_ONCE if most > PARTS_AT_ONCE else _FEW
-    return -(-most // unit) * unit
+    most = image.size // _SHARE
+    if most > PARTS_AT_ONCE:
+        return most // PARTS_AT_ONCE * PARTS_AT_ONCE
+    return max(-(-most // _FEW), 1) * _FEW
 
 
 def _bends(color: Array) -> Array:

@@ -19,7 +19,7 @@ from diffrast._topology import Topology
 from diffrast.bending import Turning, find_turning
 from diffrast.camera import Camera, central_rays, check_single
 from diffrast.deferred import comes_held, shade_covered
-from diffrast.edges import View, antialias_image, with_depth
+from diffrast.edges import Cast, View, antialias_image, with_depth
 from diffrast.geometry import (
     Points,
     apart_edges,
@@ -35,7 +35,7 @@ from diffrast.geometry import (
 from diffrast.light import Columns, casts_shadow, normalize_columns
 from diffrast.scene import Scene
 from diffrast.settings import RenderSettings
-from diffrast.shadows import Parted, Reached, parted, terminators
+from diffrast.shadows import Parted, parted, terminators
 from diffrast.surface import SHADERS, World, cast_outlines, cast_shadows, glow, receive_shadows
 from diffrast.texture import CubeTexture
 from diffrast.texturing import paint_scene, seams, skybox
@@ -151,8 +151,9 @@ def render(
             topology = scene_topology(scene)
             apart = _apart(world, topology, settings)
             turning = find_turning(face, hard) if in_batches else None
+            cast = cast_outlines(world, topology, bare.positions_clip, pixels, reached)
             view = _edged_view(
-                hard, world, topology, apart, clip, pixels, reached, background, turning, settings
+                hard, world, topology, apart, clip, face, cast, background, turning, settings
             )
             finish = None
             if turning is not None:
@@ -231,7 +232,8 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     Returns:
         For each light that casts shadows, in the scene's order, the edge between each pixel and the
         one on its right (0) and below it (1), as 3 * face + the corner opposite to it, -1 where
-        there is none; the number of pairs of pixels of one surface that a shadow parts, not folds
+        there is none, also where one of them shows something nearer that hides where the shadow
+        begins or ends; the number of pairs of pixels of one surface that a shadow parts, not folds
         of the surface, and the number of those with an edge. None without such lights or without
         objects.
 
@@ -249,11 +251,11 @@ def shadow_outlines(scene: Scene, camera: Camera, settings: RenderSettings) -> P
     lighting = "flat" if settings.shading == "unlit" else settings.shading
     world, reached = cast_shadows(scene, camera, geometry, pixels, lighting)
     topology = scene_topology(scene)
-    cast = cast_outlines(world, topology, pixels, reached)
+    cast = cast_outlines(world, topology, drawn[0].positions_clip, pixels, reached)
     assert cast is not None
     assert world.shadows is not None
     return parted(
-        scene.lights, world.shadows, geometry, topology, pixels, cast.lit, cast.edge, clip
+        scene.lights, world.shadows, geometry, topology, pixels, cast.lit, cast.between, clip
     )
 
 
@@ -279,15 +281,14 @@ def _edged_view(
     topology: Topology,
     apart: Array,
     positions_clip: Array,
-    pixels: Points,
-    reached: Reached,
+    face: Array,
+    cast: Cast | None,
     background: Array,
     turning: Turning | None,
     settings: RenderSettings,
 ) -> View:
     """What `antialias_image` takes."""
     geometry = world.geometry
-    cast = cast_outlines(world, topology, pixels, reached)
     if settings.shading == "flat":  # every face has a colour of its own
         topology = topology._replace(patches=jnp.arange(geometry.faces.shape[0]))
     view = View(
@@ -296,7 +297,7 @@ def _edged_view(
         turned=geometry.faces_outward[:, 0] != geometry.faces[:, 0],
         topology=topology,
         apart=apart,
-        face_image=pixels.face,
+        face_image=face,
         image=image,
         background=background,
         scene=world,

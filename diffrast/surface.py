@@ -63,7 +63,7 @@ def cast_shadows(
 
 
 def cast_outlines(
-    world: World, topology: Topology, points: Points, reached: Reached
+    world: World, topology: Topology, positions_clip: Array, points: Points, reached: Reached
 ) -> Cast | None:
     """The outlines of shadows between the pixels of an image; None without shadows."""
     scene, camera, _, shadows = world[:4]
@@ -81,7 +81,7 @@ def cast_outlines(
     weight = [0 if isinstance(light, DirectionalLight) else 1 for light in casting]
     lit = jnp.stack([part > 0 for part in reached if part is not None])
     return Cast(
-        edge=outlines(scene.lights, shadows, topology, points, lit),
+        between=outlines(scene.lights, shadows, topology, positions_clip, points, lit),
         lit=lit,
         patches=topology.patches,
         turned=jnp.stack(shadows.turned),

@@ -1,5 +1,6 @@
 """Outlines of shadows: found, drawn where they fall, and counted."""
 
+import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -69,6 +70,38 @@ def test_shadows_of_several_bodies_meet_in_pixels_as_they_should():
         errors.append(np.abs(picture - _mean_over_pixels(scene, camera, 32)))
     assert np.mean(errors) < 6.6e-4  # without edges .013, with 16 samples .0017
     assert np.sum(np.max(errors, axis=-1) > 0.1) <= 7
+
+
+def test_a_shadow_that_begins_under_what_casts_it():
+    """A sheet over a floor, seen from above, and its shadow, of which no pixel's centre may be.
+
+    Areas and their derivative in closed form, by how much of a pixel the sheet covers and by its
+    height, and so by how far its shadow goes beyond it.
+    """
+    size, pixel, slope = 16, 0.25, 0.5
+    down = linalg.rotation_x(-np.pi / 2)
+    camera = dr.Camera.orthographic(
+        eye=(0, 5, 0), up=(0, 0, -1), target=(0, 0, 0), height=size * pixel, near=0.1, far=20.0
+    )
+    light = sun((slope, -1.0, 0.0))
+
+    @jax.jit
+    def row(covered, height):
+        place = jnp.array([0.5 + covered * pixel - 2.0, height, 0.1])
+        grey = dr.Material(diffuse=(0.2, 0.2, 0.2))
+        sheet = dr.Object(shapes.plane(4.0, 8.0), grey, linalg.translation(place) @ down)
+        scene = dr.Scene(objects=[sheet, floor(height=0.0)], lights=[light])
+        return dr.render(scene, camera, dr.RenderSettings(height=size, width=size))[size // 2, :, 0]
+
+    dark = 0.1 * 0.8  # ambient light
+    for covered, shaded in itertools.product((0.05, 0.2, 0.4), (0.05, 0.2, 0.4)):
+        at, way = (covered, shaded * pixel / slope), (0.3, 0.1)
+        got, change = jax.jvp(row, at, way)
+        sheet, lit = got[2], got[-1]
+        want = covered * sheet + shaded * dark + (1 - covered - shaded) * lit
+        moved = way[0] * (sheet - lit) + way[1] * slope / pixel * (dark - lit)
+        np.testing.assert_allclose(got[10], want, atol=2e-5)
+        np.testing.assert_allclose(change[10], moved, rtol=1e-3)
 
 
 def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():

@@ -164,7 +164,7 @@ def _where(chosen: Array, first: list[Array], second: list[Array]) -> list[Array
 
 def _told(
     view: View, cast: Cast, pixel: Int[Array, "2 n"], found: Seen, points: int
-) -> tuple[Int[Array, "lights points"], tuple[Bool[Array, " n"], Bool[Array, " n"]]]:
+) -> tuple[Int[Array, "lights points"], Bool[Array, "3 n"]]:
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
@@ -175,7 +175,8 @@ def _told(
     colours are not used no light is asked.
 
     Also beyond which folds no pixel shows a shadow: it may begin there, but ends not far away; and
-    in front of which some do, and others do not: it is not the shading that changes there.
+    in front and beyond of which some do, and others do not: it is not the shading that changes
+    there.
     """
     (front, in_front), (beyond, around) = (
         light_told(cast, view.face_image, pixel, side.face) for side in (found.front, found.beyond)
@@ -193,7 +194,9 @@ def _told(
     inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
     parts = [front, beyond] + [inwards] * (points - 2)
     told = jnp.concatenate([jnp.where(found.visible, part, 0) for part in parts], axis=1)
-    return told, stored((asked & jnp.any(around > 0, axis=0), jnp.any(in_front == -1, axis=0)))
+    lit_around = asked & jnp.any(around > 0, axis=0)
+    parted = [jnp.any(part == -1, axis=0) for part in (in_front, around)]
+    return told, stored(jnp.stack([lit_around, *parted]))
 
 
 def with_pieces(
@@ -225,6 +228,7 @@ def with_pieces(
     area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
     smooth = jnp.zeros_like(found.visible)
+    at_centre = [side.is_centre for side in (found.front, found.beyond)]
     if method.shader is None:
         jump = behind - front
         value = area * jump
@@ -233,8 +237,9 @@ def with_pieces(
         points = [found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside]
         told = None
         if view.cast is not None and found.half_way is not None:
-            told, (lit_around, parted) = _told(view, view.cast, pieces.pixel, found, len(points))
-            smooth = smooth & ~parted
+            told, (lit_around, *parted) = _told(view, view.cast, pieces.pixel, found, len(points))
+            smooth = smooth & ~parted[0]
+            at_centre = [own & ~part for own, part in zip(at_centre, parted, strict=True)]
             points[1] = points[1][0], _where(lit_around, found.half_way, points[1][1])
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
@@ -252,7 +257,7 @@ def with_pieces(
         value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
         if view.meaned is not None:
             meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
-            first, second = (meaned & side.is_centre for side in (found.front, found.beyond))
+            first, second = (meaned & own for own in at_centre)
             value = jnp.where(first, area * (behind - own), value)
             value = jnp.where(second, value + area * (own - behind), value)
         value = jnp.where(found.wrong_side, value + front - own, value)

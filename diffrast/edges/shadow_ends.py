@@ -25,16 +25,18 @@ _ONE_LINE = 1e-3  # pixels: how far lines on two faces that are one may be apart
 
 def enter(
     ground: Plane, source: Float[Array, "3 n"], weight: Float[Array, " n"], ends: list[Array]
-) -> Bool[Array, "edges faces n"]:
+) -> tuple[Bool[Array, "edges faces n"], Bool[Array, "edges faces n"]]:
     """Whether edges go into the planes of faces, or end there: no shadow falls beyond.
 
-    Not those that lie in them.
+    Not those that lie in them. And whether they rise out of them towards the light.
     """
     first, last = (dot_rows(ground.normal, end[:, :, None]) + ground.offset for end in ends)
     to_light = dot_rows(ground.normal, source[:, None, None]) + ground.offset * weight
     size = largest(ends[1] - ends[0])[:, None]
-    lower = jnp.where(to_light < 0, -jnp.maximum(first, last), jnp.minimum(first, last))
-    return stored((lower < _TOUCHES * size) & (jnp.abs(last - first) > _STEEP * size))
+    low, high = jnp.minimum(first, last), jnp.maximum(first, last)
+    low, high = jnp.where(to_light < 0, -high, low), jnp.where(to_light < 0, -low, high)
+    goes_in = (low < _TOUCHES * size) & (high - low > _STEEP * size)
+    return stored((goes_in, high > _TOUCHES * size))
 
 
 def common(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:

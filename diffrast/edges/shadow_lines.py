@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
-from diffrast.edges.neighborhood import Surface, first_row, picked, pixels_round, steps_to
+from diffrast.edges.neighborhood import Surface, first_row, picked, pixels_round, steps_to, walk
 from diffrast.edges.pieces import Depth, positive_part
 from diffrast.edges.planes import (
     Columns,
@@ -57,9 +57,12 @@ from diffrast.edges.shadow_planes import (
     shadow_plane,
 )
 
+ON_BOTH, ON_FIRST, ON_SECOND = range(3)  # which of two pixels show what a shadow falls on; if one
+# does, what the other one shows is nearer, and hides where the shadow begins or ends.
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
+_PLACE = np.argsort(_NEAREST)  # of pixels among these,
 _CROSS = 5  # of which the first so many are the middle one and the four next to it
 _EDGES = 4  # whose shadows part a pixel, at most,
 _FACES = 4  # on so many faces
@@ -77,9 +80,9 @@ _DIRECTION, _FIRST, _SECOND = np.array(
 class Cast(NamedTuple):
     """The shadows of a scene, by their lights."""
 
-    edge: Int[Array, "lights 2 height_with_border width_with_border"]
-    # 3 * face + corner: the edge of the face opposite to the corner, whose shadow passes between a
-    # pixel and the one on its right, or below it; -1 if there is none.
+    between: Int[Array, "lights 2 height_with_border width_with_border"]
+    # `coded`: the edge whose shadow passes between a pixel and the one on its right, or below it;
+    # -1 if there is none.
     lit: Bool[Array, "lights height_with_border width_with_border"]
     patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
     turned: Bool[Array, "lights F"]  # faces that turn their outside to the light
@@ -109,6 +112,7 @@ class Outlines(NamedTuple):
     weight: Float[Array, " n"]  # and its h
     lit_on_right: Bool[Array, "edges faces n"]
     looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
+    hider: Int[Array, "edges n"]  # what hides where the shadow begins or ends; -1: nothing
     centre_is_lit: Bool[Array, " n"]  # in the image
     alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light
     shift: Float[Array, "2 n"]  # of all lines of a pixel: see `past_centre`
@@ -148,9 +152,23 @@ def with_lights(
     return cast, jnp.concatenate([cast.source / unit, rows])
 
 
+def coded(edge: Int[Array, "*n"], ground: Int[Array, "*n"]) -> Int[Array, "*n"]:
+    """One number of edges, 3 * face + corner, and the pixels that show what their shadow falls on.
+
+    -1 where there is no edge.
+    """
+    return jnp.where(edge < 0, -1, 3 * edge + ground)
+
+
+def decoded(code: Int[Array, "*n"]) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]:
+    """Edges and pixels of such numbers."""
+    edge, ground = divided(jnp.maximum(code, 0), 3)
+    return jnp.where(code < 0, -1, edge), ground
+
+
 def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
     """Indices (light, row, column) of pixels round which an outline passes, and how many."""
-    right, below = (cast.edge[:, k] >= 0 for k in range(2))
+    right, below = (cast.between[:, k] >= 0 for k in range(2))
     right = right[:, :-2] | right[:, 1:-1] | right[:, 2:]
     below = below[:, :-2] | below[:, 1:-1]
     right = right[:, :, :-2] | right[:, :, 1:-1]
@@ -183,12 +201,21 @@ def cross_shadows(
     counts = stored(same & cast.turned[light, seen])
     lit = stored(cast.lit[light, row, column])
 
-    between = stored(cast.edge[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
-    known = exists & (between >= 0) & same[_FIRST] & same[4]
+    between, on_one = decoded(
+        stored(cast.between[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
+    )
+    is_ground = jnp.where(on_one == ON_SECOND, same[_SECOND], same[_FIRST]) & same[4]
+    known, between = stored((exists & (between >= 0) & is_ground, between))
     pair, found = _unlike(between, known, _EDGES)
-    edge = jnp.stack([picked(between, k) for k in pair])
     looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
-    first_is_lit = jnp.stack([picked(lit, k) for k in looks[0]])
+    first_column, its_row = pixel[:, None] + 1 + steps_to(looks[0])
+    chosen_pair = light, jnp.asarray(_DIRECTION)[pair], its_row, first_column
+    edge, on_one = stored(decoded(cast.between[chosen_pair]))
+    is_second, is_hidden = on_one == ON_SECOND, on_one != ON_BOTH
+    home, away = jnp.where(is_second, looks[::-1], looks)
+    first_is_lit = jnp.stack([picked(lit, k) for k in home]) != is_second
+    hider = jnp.where(is_hidden, jnp.stack([picked(shown, k) for k in away]), -1)
+    shows_ground = jnp.where(is_hidden, home, looks)
     looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
 
     def beside(face: Array) -> tuple[Array, Array]:
@@ -227,7 +254,7 @@ def cross_shadows(
     shadow, behind, *ends_of = (
         Plane(p.normal[:, :, None], p.offset[:, None]) for p in (shadow, behind, *ends_of)
     )
-    enters = enter(ground, source, weight, ends)
+    enters, rises = enter(ground, source, weight, ends)
     normal, foot, inverse = stored(line_of(ground, shadow))
     # It is dark on the side of the face that casts the shadow; unless that is seen edge-on by the
     # light, when the two pixels tell.
@@ -242,7 +269,7 @@ def cross_shadows(
     of_pair = jnp.broadcast_to(is_own, passes.shape)
     for look in looks:
         of_pair = of_pair | (jnp.stack([picked(shown, k) for k in look])[:, None] == ground_face)
-    valid = found & jnp.any(of_pair & received & passes, axis=1)
+    valid = found & jnp.any(of_pair & received & passes & rises, axis=1)
     usable = valid[:, None] & received & (inverse > 0)
 
     # Outlines of one shadow go on in the next edge.
@@ -262,7 +289,9 @@ def cross_shadows(
 
     along = REACH * jnp.stack([-normal[1], normal[0]])
     limits = [meeting(ground, plane) for plane in (*ends_of, behind)]
-    cut = [*(jnp.any(meet & chosen, axis=1)[:, None] for meet in meets), enters]
+    # Of those that begin or end behind something no pixel may show which one they go on in.
+    at_ends = [(jnp.any(meet & chosen, axis=1) | is_hidden)[:, None] for meet in meets]
+    cut = [*at_ends, enters]
 
     def inside(at: Array) -> list[Array]:
         x, y = at
@@ -301,7 +330,8 @@ def cross_shadows(
         source=source,
         weight=weight,
         lit_on_right=lit_on_right,
-        looks=looks,
+        looks=jnp.where(first_is_lit, shows_ground, shows_ground[::-1]),
+        hider=hider,
         centre_is_lit=lit[4],
         alone=alone,
         shift=past_centre(outwards, beyond, passed, lit[4]),
@@ -336,13 +366,13 @@ def shadow_of(
     """These lines, and how they move."""
     faces = surface.faces
     row, place = divided(line, outlines.weight.size)
-    edge, column = divided(row, _FACES)
+    number, column = divided(row, _FACES)
 
     def of_edge(values: Array) -> Array:
-        return values[..., edge, place]
+        return values[..., number, place]
 
     def one(values: Array) -> Array:
-        return values[..., edge, column, place]
+        return values[..., number, column, place]
 
     (light, rows_of_light, pixel), source, weight = stored_together(
         jax.tree.map(
@@ -362,7 +392,12 @@ def shadow_of(
     low, high = stored_together((one(outlines.range[0]), one(outlines.range[1])))
 
     whole = foot + low * along, foot + high * along
-    at, hides = _before(pixel, of_edge(outlines.edge), face, cast, surface, face_image)
+    # What hides where it begins may go on over the line, in faces that no pixel shows.
+    places = jnp.stack([whole[0], foot + (low + high) / 2 * along, whole[1]], axis=1)
+    there_x, there_y = stored((pixel[:, None].astype(places.dtype) + 0.5) + places)
+    covering, _ = walk(jnp.stack([of_edge(outlines.hider)] * 3), there_x, there_y, surface)
+    edge = of_edge(outlines.edge)
+    at, hides = _before(pixel, edge, covering, face, cast, surface, face_image)
     first, last = (stored(jnp.stack([*point, _nearness(ground, *point)])) for point in whole)
     bare = uncovered(first, last, at, hides)
     low, high = stored_together([low + part * (high - low) for part in bare])
@@ -436,10 +471,16 @@ def light_told(
     same = (shown >= 0) & (cast.patches[seen] == cast.patches[face])
     counts = same & cast.turned[:, seen]
     lit = cast.lit[:, row, column]
+    # Whether a shadow may begin, on what the middle pixel shows, behind what others do.
+    first, second = _PLACE[_FIRST], _PLACE[_SECOND]
+    _, ground = decoded(cast.between[:, _DIRECTION[:, None], row[first], column[first]])
+    hidden = ((ground == ON_FIRST) & same[first]) | ((ground == ON_SECOND) & same[second])
+    hidden = jnp.any(hidden, axis=1) & same[0]
 
     def told(rows: int) -> Array:
         bright, dark = (jnp.any((counts & part)[:, :rows], axis=1) for part in (lit, ~lit))
         alike = jnp.where(bright, jnp.where(dark, -1, 1), jnp.where(dark, 0, -2))
+        alike = jnp.where(hidden, -1, alike)
         return jnp.where(cast.turned[:, face], alike, 0)
 
     return stored((jnp.maximum(told(_CROSS), -1), told(len(_NEAREST))))
@@ -448,6 +489,7 @@ def light_told(
 def _before(
     pixel: Int[Array, "2 n"],
     edge: Int[Array, " n"],
+    covering: Int[Array, "3 n"],
     face: Int[Array, " n"],
     cast: Cast,
     surface: Surface,
@@ -455,12 +497,14 @@ def _before(
 ) -> tuple[Float[Array, "3 3 faces n"], Bool[Array, "faces n"]]:
     """Corners of faces that may hide the shadows of edges on other faces, and which of them do.
 
-    What is seen at the 3×3 pixels, but for the surface of the other face, and what is at the edges.
+    What is seen at the pixels round each, but for the surface of the other face, what is at the
+    edges, and what is known to be `covering` places of the lines.
     """
     faces, pixels, topology, volume = surface
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
     at_edge = jnp.stack([caster, topology.neighbors[caster, third]])
-    others = jnp.concatenate([stored(pixels_round(face_image, *pixel)), at_edge])
+    around = stored(pixels_round(face_image, *pixel))[_NEAREST[1:]]
+    others = jnp.concatenate([around, at_edge, covering])
     there = jnp.maximum(others, 0)
     hides = (others >= 0) & (volume[there] != 0) & (cast.patches[there] != cast.patches[face])
     return _from_centre(corners_of(others, faces, pixels), pixel), stored(hides)

@@ -6,9 +6,14 @@ followed from that face to the next across their common edge, to where the surfa
 away from the light. Where something else hides the light just beyond, that is followed on, until
 nothing does. The last edge has the outline of the shadow that passes between the two pixels,
 whatever the size of faces and texels. Indices only: no derivatives.
+
+Where one of them shows something nearer, the other's surface may be lit at one and dark at the
+other, too: a shadow begins under the outline of what casts it. There the point of the surface's
+plane behind the nearer thing is the lit or the dark one.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -22,10 +27,20 @@ from diffrast._selection import divided, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import Surface, first_row, picked, walk
-from diffrast.edges.pieces import facing, to_pixels
-from diffrast.edges.planes import Table, barycentrics, edge_functions, largest, lowest
+from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
+from diffrast.edges.planes import (
+    Table,
+    barycentrics,
+    corners_of,
+    edge_functions,
+    edge_values,
+    largest,
+    lowest,
+)
+from diffrast.edges.shadow_lines import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
+from diffrast.raster.evaluate import unit_of
 from diffrast.shadows.cast import Shadows, by_resolution, shone_on
 from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import Rays, face_corners, faces_near, line_of, seen_by_light
@@ -50,7 +65,7 @@ class Parted(NamedTuple):
     turns away from the light, as that is what parts them.
     """
 
-    edge: Int[Array, "lights 2 height width"]  # result of `outlines`
+    edge: Int[Array, "lights 2 height width"]  # 3 * face + corner, or -1
     pairs: Int[Array, " lights"]  # how many there are
     found: Int[Array, " lights"]  # and between how many of them an outline passes that is known
 
@@ -67,6 +82,7 @@ def outlines(
     lights: tuple[Light, ...],
     shadows: Shadows,
     topology: Topology,
+    positions_clip: Float[Array, "V 4"],
     points: Points,
     lit: Bool[Array, "lights height width"],
 ) -> Int[Array, "lights 2 height width"]:
@@ -76,15 +92,16 @@ def outlines(
         lights: of the scene.
         shadows: of these lights.
         topology: of its faces.
+        positions_clip: of its vertices.
         points: what each pixel sees.
         lit: whether each of the lights with shadows reaches it.
 
     Returns:
-        3 * face + corner, the edge of a face opposite to a corner, or -1: between the pixel and
-        that on its right, and that below it.
+        `coded` edges, or -1: between the pixel and that on its right, and that below it.
     """
     casting = [light for light in lights if casts_shadow(light)]
-    geometry, points = shadows.geometry, lax.stop_gradient(points)
+    geometry = shadows.geometry
+    positions_clip, points = lax.stop_gradient((positions_clip, points))
     found: dict[int, Array] = {}
     with jax.named_scope("outlines"):
         for pictures, (_, members) in zip(shadows.pictures, by_resolution(casting), strict=True):
@@ -95,7 +112,8 @@ def outlines(
                 turned=jnp.stack([shadows.turned[i] for i in members]),
             )
             between = over_views(_between_pixels, points.face.size)
-            edges = between(lamps, pictures, geometry, topology, points, lit[np.array(members)])
+            lit_by = lit[np.array(members)]
+            edges = between(lamps, pictures, geometry, topology, positions_clip, points, lit_by)
             found.update(zip(members, edges, strict=True))
     return jnp.stack([found[i] for i in range(len(casting))])
 
@@ -105,40 +123,75 @@ def _between_pixels(
     pictures: Pictures,
     geometry: Geometry,
     topology: Topology,
+    positions_clip: Float[Array, "V 4"],
     points: Points,
     lit: Bool[Array, "lights height width"],
 ) -> Int[Array, "lights 2 height width"]:
     height, width = points.face.shape
     face, bright = points.face.reshape(-1), lit.reshape(len(lamps.first), -1)
-    barycentrics = jnp.stack([part.reshape(-1) for part in points.barycentrics])
+    shares = jnp.stack([part.reshape(-1) for part in points.barycentrics])
+    scale = stored(scale_by_depth(depth_of(positions_clip), positions_clip))
+    pixels = positions_clip * (scale / unit_of(positions_clip))[:, None]
+    pixels = stored(to_pixels(pixels, height, width))
 
-    def dark_and_bright(number: Array) -> tuple[Array, Array, Array]:
-        """The lights and the pixels of pairs."""
+    def of_pair(number: Array) -> tuple[Array, Array]:
+        """The lights of pairs, and their two pixels."""
         pair, at = divided(number, height * width)
         lamp, is_below = divided(pair, 2)
-        next_at = at + jnp.where(is_below == 0, 1, width)
+        return stored((lamp, jnp.stack([at, at + jnp.where(is_below == 0, 1, width)])))
+
+    def ground_of(number: Array) -> tuple[Array, Array]:
+        """On the surface of which of them a shadow may begin or end between them, -1 on none.
+
+        Also the barycentric coordinates of where the plane of what each shows is at the other one.
+        """
+        lamp, at = of_pair(number)
+        shown = stored(face[at])
+        patch, turned = stored((topology.patches[shown], lamps.turned[lamp, shown]))
         is_lit = bright[lamp, at]
-        return lamp, jnp.where(is_lit, next_at, at), jnp.where(is_lit, at, next_at)
+        parts = (is_lit[0] != is_lit[1]) & jnp.where(is_lit[0], turned[1], turned[0])
+        corners = corners_of(shown, geometry.faces, pixels)
+        row, column = (place.astype(pixels.dtype) + 0.5 for place in divided(at, width))
+        _, nearness = edge_values(corners, column, row)
+        values, there = edge_values(corners, column[::-1], row[::-1])
+        hidden = turned & (there > 0) & (there < nearness[::-1])
+        on_one = jnp.where(hidden[0], ON_FIRST, jnp.where(hidden[1], ON_SECOND, -1))
+        ground = jnp.where(patch[0] == patch[1], jnp.where(parts, ON_BOTH, -1), on_one)
+        ground = jnp.where(jnp.min(shown, axis=0) < 0, -1, ground)
+        scales = stored(scale[stored(geometry.faces.T[:, jnp.maximum(shown, 0)])])
+        return stored((ground, jnp.stack(barycentrics([*(scales * jnp.stack(values))]))))
 
-    def is_asked(number: Array) -> Array:
-        """Whether both show one surface, at the dark one turned to the light."""
-        lamp, *ends = dark_and_bright(number)
-        dark, bright_end = (face[end] for end in ends)
-        one_surface = topology.patches[dark] == topology.patches[bright_end]
-        return (jnp.minimum(dark, bright_end) >= 0) & one_surface & lamps.turned[lamp, dark]
+    patch = topology.patches[points.face]
+    differs = _side_by_side(lit, jnp.not_equal) | _side_by_side(patch, jnp.not_equal)
+    order, count = selected(differs, lambda number: ground_of(number)[0] >= 0)
 
-    differs = _side_by_side(lit, jnp.not_equal)
-    order, count = selected(differs.reshape(-1), is_asked)
-
-    def look(number: Array, exists: Array, edges: Array) -> Array:
-        lamp, *ends = dark_and_bright(number)
-        dark, bright_end = (Points(face[i], list(barycentrics[:, i]), i) for i in stored(ends))
-        edge = _edge_between(lamps, lamp, exists, pictures, geometry, topology, dark, bright_end)
-        place = jnp.where(exists, number, edges.size)
-        return edges.at[place].set(edge, mode="drop")
+    def look(number: Array, exists: Array, codes: Array) -> Array:
+        (ground, extended), (lamp, at) = ground_of(number), of_pair(number)
+        unsure, is_second = ground != ON_BOTH, ground == ON_SECOND
+        home, away = jnp.where(is_second, at[::-1], at)
+        own = stored(face[home])
+        there = jnp.where(is_second, extended[:, 1], extended[:, 0])
+        there = jnp.where(unsure, there, shares[:, away])
+        ends = [
+            Points(own, list(shares[:, home]), home),
+            Points(jnp.where(unsure, own, face[away]), list(there), away),
+        ]
+        is_lit = bright[lamp, home]
+        dark, lit_end = _where(is_lit, ends[1], ends[0]), _where(is_lit, ends[0], ends[1])
+        guessed = jnp.stack([unsure & is_lit, unsure & ~is_lit])
+        edge = _edge_between(
+            lamps, lamp, exists, guessed, pictures, geometry, topology, *stored((dark, lit_end))
+        )
+        place = jnp.where(exists, number, codes.size)
+        return codes.at[place].set(coded(edge, ground), mode="drop")
 
     none = jnp.full(differs.size, -1, jnp.int32) + zero_after(count)
     return over_batches(order, count, lanes() * _AT_ONCE, look, none).reshape(differs.shape)
+
+
+def _where(chosen: Bool[Array, " n"], one: Points, other: Points) -> Points:
+    """The first ones where they are chosen, else the second ones."""
+    return jax.tree.map(partial(jnp.where, chosen), one, other)
 
 
 def _side_by_side(
@@ -160,11 +213,12 @@ def parted(
     topology: Topology,
     points: Points,
     lit: Bool[Array, "lights height width"],
-    edge: Int[Array, "lights 2 height width"],
+    between: Int[Array, "lights 2 height width"],
     positions_clip: Float[Array, "V 4"],
 ) -> Parted:
     """Count the pairs between which `outlines` looked for edges, and those with one."""
     height, width = points.face.shape
+    edge, _ = decoded(between)
     pixels = to_pixels(positions_clip, height, width)
     volume = facing(pixels, geometry.faces, height=height, width=width)
     shadowed = ~lit & shone_on(lights, shadows, points)
@@ -217,13 +271,18 @@ def _edge_between(
     lamps: _Lamps,
     lamp: Int[Array, " n"],
     asked: Bool[Array, " n"],
+    guessed: Bool[Array, "2 n"],
     pictures: Pictures,
     geometry: Geometry,
     topology: Topology,
     dark: Points,
     bright: Points,
 ) -> Int[Array, " n"]:
-    """The edge whose shadow passes between points in the dark and others in the light."""
+    """The edge whose shadow passes between points in the dark and others in the light.
+
+    Of some it is `guessed` that they are in the dark (0), or in the light (1); there is none if
+    they are not.
+    """
     at_dark, at_bright = (
         stored(jnp.stack(positions_at(geometry, points))) for points in (dark, bright)
     )
@@ -233,7 +292,7 @@ def _edge_between(
     for end in (at_dark, at_bright):
         x, y, w = seen(end)
         ends.append(stored([x / jnp.where(w > 0, w, 1), y / jnp.where(w > 0, w, 1)]))
-    zero = jnp.zeros_like(at_dark[0])
+    zero, unsure = jnp.zeros_like(at_dark[0]), guessed[0] | guessed[1]
 
     def corners_of(face: Array) -> Array:
         return seen(face_corners(geometry, face))
@@ -249,7 +308,9 @@ def _edge_between(
         farthest = jnp.max(part, axis=0)
         nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
         row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
-        hidden = rays.asked & ((farthest >= 0) | (looks == 0))
+        hidden = rays.asked & ((farthest >= 0) | ((looks == 0) & ~unsure))
+        # At a guessed end, where the way ends, too, only whether anything hides the light counts.
+        at_end = rays.asked & guessed[1] & (looks > 0) & jnp.any(nearby.cut.stops > 0, axis=0)
         face = jnp.where(hidden, picked(nearby.face, row), -1)
         face = _covering(face, farthest < 0, topology.neighbors, corners_of, way[0])
         following, end = _follow(face, topology.neighbors, corners_of, way)
@@ -259,10 +320,15 @@ def _edge_between(
         x, y = (a + end * (b - a) for a, b in zip(*way, strict=True))
         goes_on = following >= 0
         ground = _covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
-        shares = barycentrics(edge_functions(corners_of(ground), x, y)[0])
-        goes_on = goes_on & (jnp.min(jnp.stack(shares), axis=0) >= 0)
-        rays = rays._replace(face=ground, barycentrics=jnp.stack(shares), x=x, y=y, asked=goes_on)
-        return stored((looks + 1, rays, jnp.where(following >= 0, following, edge)))
+        shares = jnp.stack(barycentrics(edge_functions(corners_of(ground), x, y)[0]))
+        goes_on = goes_on & (guessed[1] | (jnp.min(shares, axis=0) >= 0))
+        shares = jnp.where(guessed[1], jnp.stack(bright.barycentrics), shares)
+        x, y = (jnp.where(guessed[1], a, b) for a, b in zip(ends[1], (x, y), strict=True))
+        ground = jnp.where(guessed[1], bright.face, ground)
+        rays = rays._replace(face=ground, barycentrics=shares, x=x, y=y, asked=goes_on)
+        edge = jnp.where(unsure & (hidden | at_end), -1, edge)
+        edge = jnp.where(following >= 0, following, edge)
+        return stored((looks + 1, rays, edge))
 
     def is_left(state: _Look) -> Array:
         return anywhere((state[0] < _LOOKS) & jnp.any(state[1].asked))
