@@ -1,6 +1,7 @@
 """Polygons of any number of corners, and the triangles that they are cut into; on the host."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,16 +104,47 @@ def triangulate(positions: np.ndarray, polygons: Polygons) -> np.ndarray:
     is_left = np.sum(turn * polygons.normal[index], axis=1) > 0
     convex = np.logical_and.reduceat(is_left, polygons.start)
 
-    start = polygons.start[index]
-    local = np.arange(len(corner)) - start
-    middle = np.flatnonzero(convex[index] & (local >= 1) & (local < polygons.size[index] - 1))
-    triangles = [np.stack([start[middle], middle, middle + 1], axis=1)]
-    for concave in np.flatnonzero(~convex):
-        begin, size = polygons.start[concave], polygons.size[concave]
-        outline = _project(here[begin : begin + size], polygons.normal[concave])
-        triangles.append(begin + np.array(clip_ears(outline)))
-    faces = np.concatenate(triangles)
-    return faces[np.argsort(polygon[faces[:, 0]], kind="stable")]
+    concave = np.flatnonzero(~convex)
+    return _cut(here, polygons.start, polygons.size, polygons.normal, concave)
+
+
+def triangles_in_order(
+    positions: Callable[[], np.ndarray], polygons: Sequence[Sequence[int]]
+) -> np.ndarray:
+    """Triangles (faces, 3) of lists of three vertex ids or more, two fewer than each has corners.
+
+    They are indices into all lists end to end, polygon after polygon. A polygon becomes the fan
+    round its first corner where that turns no triangle over; others are cut ear by ear. `positions`
+    makes the places of vertices, and is called where a polygon has four corners or more.
+    """
+    size = np.array([len(ids) for ids in polygons], dtype=int)
+    if not np.any(size > 3):
+        return np.arange(np.sum(size)).reshape(-1, 3)
+    places = positions()
+    corner = np.array([*chain.from_iterable(polygons)], dtype=int)
+    start, polygon = np.cumsum(size) - size, np.repeat(np.arange(len(size)), size)
+    with np.errstate(invalid="ignore", over="ignore"):
+        normal, _ = _newell(places, corner, polygon, len(size))
+        here = places[corner]
+        fans = _cut(here, start, size, normal, ())
+        a, b, c = np.moveaxis(here[fans], 1, 0)
+        of_fan = polygon[fans[:, 0]]
+        turned_over = np.sum(np.cross(b - a, c - a) * normal[of_fan], axis=1) < 0
+        return _cut(here, start, size, normal, np.unique(of_fan[turned_over]))
+
+
+def _cut(
+    here: np.ndarray, start: np.ndarray, size: np.ndarray, normal: np.ndarray, by_ears: Any
+) -> np.ndarray:
+    """Triangles of polygons with corners `here` end to end: fans, but for those cut ear by ear."""
+    first = np.repeat(start, size - 2)
+    triangles = np.stack([first, *(np.arange(len(first)) + k for k in (1, 2))], axis=1)
+    triangles[:, 1:] += 2 * np.repeat(np.arange(len(size)), size - 2)[:, None]
+    for number in by_ears:
+        begin, end = start[number], start[number] + size[number]
+        ears = clip_ears(_project(here[begin:end], normal[number]))
+        triangles[begin - 2 * number : end - 2 * (number + 1)] = begin + np.array(ears)
+    return triangles
 
 
 def _project(points: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -99,6 +99,56 @@ def test_obj_polygons_become_fans_in_their_order(tmp_path):
     np.testing.assert_array_equal(read.faces, want)
 
 
+# A concave outline, of area 2.5.
+DART = [(0, 0), (2, 0), (2, 2), (1, 0.5), (0, 2)]
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".PLY"])
+@pytest.mark.parametrize("first", range(len(DART)))
+def test_concave_polygons_are_cut_within_their_outline(tmp_path, suffix, first):
+    outline = np.roll(DART, -first, axis=0)
+    flat = np.insert(outline, 2, 0, axis=1)
+    points = np.concatenate([flat, flat[:, [2, 0, 1]]])
+    rows = [" ".join(map(str, point)) for point in points.tolist()]
+    polygons, uvs = ([[*range(n)], [*range(n, 2 * n)]] for n in (5, 10))
+    lists = ["5 {} {} {} {} {}".format(*polygon) for polygon in polygons]
+    path = tmp_path / f"a{suffix.lower()}"
+    if suffix == ".obj":
+        text = "".join(f"v {row}\nvt {k} 0\n" for k, row in enumerate(rows))
+        text += "f 1/1 2/2 3/3 4/4 5/5\nf -5/-5 -4/-4 -3/-3 -2/-2 -1/-1\n"
+        write(path, text)
+    elif suffix == ".off":
+        write(path, "\n".join(["OFF 10 2 0", *rows, *lists]))
+    else:  # its faces before its vertices, which is no less a PLY file
+        vertex = "element vertex 10\nproperty double x\nproperty double y\nproperty double z\n"
+        face = "element face 2\nproperty list uchar int vertex_indices\n"
+        face += "property list uchar float texcoord\n"
+        if suffix == ".ply":
+            both = [
+                f"{row} 10 {' '.join(map(str, uv))}" for row, uv in zip(lists, uvs, strict=True)
+            ]
+            head = f"ply\nformat ascii 1.0\n{face}{vertex}end_header\n"
+            write(path, head + "\n".join([*both, *rows]))
+        else:
+            body = b"".join(
+                struct.pack(">B5iB10f", 5, *polygon, 10, *uv)
+                for polygon, uv in zip(polygons, uvs, strict=True)
+            )
+            head = f"ply\nformat binary_big_endian 1.0\n{face}{vertex}end_header\n"
+            path.write_bytes(head.encode() + body + points.astype(">f8").tobytes())
+    read = load_mesh(path)
+    assert len(read.faces) == 6
+    a, b, c = np.moveaxis(corners(read), 1, 0)
+    area = np.cross(b - a, c - a) / 2
+    np.testing.assert_allclose(area[:3, 2].sum(), 2.5, rtol=1e-6)
+    np.testing.assert_allclose(area[3:, 0].sum(), 2.5, rtol=1e-6)
+    assert np.linalg.norm(area, axis=1).sum() < 5 + 1e-5
+    if suffix != ".off":
+        step = 1 if suffix == ".obj" else 2
+        number = np.round(corners(read, "uvs")[..., 0] / step).astype(int)
+        np.testing.assert_allclose(corners(read), points[number], atol=1e-6)
+
+
 def test_obj_relative_indices_count_back_from_their_line(tmp_path):
     text = "v 9 9 9\n" + QUAD + "f -4 -3 -2 -1\nv 0 0 5\nf -1 -4 2\n"
     read = load_mesh(write(tmp_path / "a.obj", text))

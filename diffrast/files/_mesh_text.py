@@ -9,12 +9,13 @@ normals and texture coordinates. Each check here raises `ValueError` "file:line:
 
 import re
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from diffrast._polygons import triangles_in_order
 from diffrast._tokens import decoded, is_finite, whole
 
 _OBJ_SIZES = {"v": 3, "vt": 2, "vn": 3}
@@ -53,7 +54,7 @@ class PlainObj(NamedTuple):
 def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> PlainObj:
     """An OBJ file, checked.
 
-    Triangles only (polygons as fans), indices from the start of the file, one blank between
+    Triangles only (see `triangles_in_order`), indices from the start of the file, one blank between
     words, the same kind of corner (v, v/vt, v//vn, v/vt/vn) wherever a material is: texture
     coordinates and normals are kept where all its corners have them. Groups, objects, lines and
     colours are dropped. Without `keep_materials` numbers only part faces with unlike corners.
@@ -79,16 +80,26 @@ def plain_obj(text: str, name: str, *, keep_materials: bool = False) -> PlainObj
     unlike: dict[tuple[bool, bool], int] = {}
     lines: list[str] = []
     numbers: list[int] = []
-    for line, material, corners in faces:
+    for line, _, corners in faces:
+        _obj_in_range(line, corners, counts, name)
+
+    def positions() -> np.ndarray:
+        return np.array([row.split()[1:] for row in vertices if row.startswith("v ")], dtype=float)
+
+    polygons = [[corner[0] - 1 for corner in corners] for _, _, corners in faces]
+    triangles = iter(triangles_in_order(positions, polygons).tolist())
+    end = 0
+    for _, material, corners in faces:
         kind = kinds[material]
         number = materials.setdefault(material, len(materials))
         if not keep_materials:
             number = unlike.setdefault(kind, len(unlike))
         if numbers[-1:] != [number]:
             lines.append(f"usemtl {number}")
-        _obj_in_range(line, corners, counts, name)
         written = [_obj_corner(corner, kind) for corner in corners]
-        lines += [f"f {written[0]} {b} {c}" for b, c in pairwise(written[1:])]
+        for triangle in islice(triangles, len(corners) - 2):
+            lines.append("f " + " ".join(written[k - end] for k in triangle))
+        end += len(corners)
         numbers += [number] * (len(corners) - 2)
     text = "\n".join([*vertices, *lines, ""])
     return PlainObj(text, numbers, list(materials), libraries)
@@ -191,7 +202,7 @@ class OffMesh(NamedTuple):
 
 
 def read_off(text: str, name: str) -> OffMesh:
-    """An OFF file, checked; its polygons as fans, in their places.
+    """An OFF file, checked; its polygons as triangles, in their places.
 
     A vertex has a position (4OFF: and what to divide it by), with N a normal, with C a colour of 3
     or 4 numbers, with ST texture coordinates, in this order. Colours are dropped.
@@ -223,13 +234,13 @@ def read_off(text: str, name: str) -> OffMesh:
     for k in range(sizes[1]):
         number, words = next_line(body, f"face {k}", name, number)
         check_indices(words, len(vertices), f"{name}:{number}")
-        first, *others = map(int, words[1 : 1 + int(words[0])])
-        faces += [[first, b, c] for b, c in pairwise(others)]
+        faces.append([int(word) for word in words[1 : 1 + int(words[0])]])
     width = 3 + 3 * bool(kind["normal"]) + 2 * bool(kind["uv"])
     values = np.array(vertices, dtype=float).reshape(-1, width)
+    corners = np.array([*chain.from_iterable(faces)], dtype=int)
     return OffMesh(
         vertices=values[:, :3],
-        faces=np.array(faces, dtype=int).reshape(-1, 3),
+        faces=corners[triangles_in_order(lambda: values[:, :3], faces)],
         normals=values[:, 3:6] if kind["normal"] else None,
         uvs=values[:, -2:] if kind["uv"] else None,
     )

@@ -7,11 +7,13 @@ edges, in memory that grows with the largest index, and no faces.
 
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from diffrast._polygons import triangles_in_order
 from diffrast._tokens import is_finite
 from diffrast.files._mesh_text import (
     check_indices,
@@ -39,6 +41,9 @@ class _Property(NamedTuple):
     length: str | None  # type of the length of a list
 
 
+_Row: TypeAlias = Mapping[str, Sequence[Any]]  # values of the properties of one thing
+
+
 class _Element(NamedTuple):
     name: str
     size: int
@@ -46,7 +51,7 @@ class _Element(NamedTuple):
 
 
 def plain_ply(content: bytes, name: str) -> bytes:
-    """A PLY file whose polygons are fans, in their places, without what its faces have besides.
+    """A PLY file of triangles, polygons cut in their places, without what faces have besides.
 
     Texture coordinates of the corners of faces are kept. Text is checked to its end.
 
@@ -143,27 +148,42 @@ def _face_lists(element: _Element, name: str) -> list[_Property]:
     return [indices[0], *([lists["texcoord"]] if "texcoord" in lists else [])]
 
 
-def _fan(
-    row: Mapping[str, Sequence[Any]], lists: list[_Property], where: str
-) -> Iterator[list[list[Any]]]:
-    """The lists of each triangle of a polygon."""
-    values = [row[kind.name] for kind in lists]
-    size = len(values[0])
-    if len(values) > 1 and len(values[1]) != 2 * size:
+def _check_coordinates(row: _Row, lists: list[_Property], where: str) -> None:
+    """Whether a face has as many texture coordinates as its corners want."""
+    size, *given = (len(row[kind.name]) for kind in lists)
+    if given and given[0] != 2 * size:
         raise ValueError(
-            f"{where}: wanted {2 * size} texture coordinates of {size} corners, got"
-            f" {len(values[1])}"
+            f"{where}: wanted {2 * size} texture coordinates of {size} corners, got {given[0]}"
         )
-    for second in range(1, size - 1):
-        corners = (0, second, second + 1)
-        triangle = [[values[0][k] for k in corners]]
-        if len(values) > 1:
-            triangle.append([values[1][2 * k + axis] for k in corners for axis in (0, 1)])
-        yield triangle
+
+
+def _cut(
+    faces: list[_Row], lists: list[_Property], positions: Callable[[], np.ndarray]
+) -> Iterator[list[list[Any]]]:
+    """The lists of each triangle of all polygons."""
+    corners = [(row, k) for row in faces for k in range(len(row[lists[0].name]))]
+    polygons = [[int(vertex) for vertex in row[lists[0].name]] for row in faces]
+    for triangle in triangles_in_order(positions, polygons).tolist():
+        some = [corners[k] for k in triangle]
+        vertices = [row[lists[0].name][k] for row, k in some]
+        coordinates = [
+            [row[kind.name][2 * k + axis] for row, k in some for axis in (0, 1)]
+            for kind in lists[1:]
+        ]
+        yield [vertices, *coordinates]
 
 
 def _triangles(count: int, lists: list[_Property]) -> _Element:
     return _Element("face", count, [kind._replace(length="uchar") for kind in lists])
+
+
+def _positions(rows: Iterable[_Row], name: str) -> np.ndarray:
+    """x, y and z of vertices."""
+    try:
+        places = [[row[axis][0] for axis in "xyz"] for row in rows]
+    except (KeyError, IndexError) as error:
+        raise ValueError(f"{name}: wanted vertices with x, y and z, got others") from error
+    return np.array(places, dtype=float).reshape(-1, 3)
 
 
 def _vertex_count(elements: list[_Element]) -> int:
@@ -176,14 +196,14 @@ def _vertex_count(elements: list[_Element]) -> int:
 def _plain_text(
     elements: list[_Element], lines: Iterator[tuple[int, list[str]]], number: int, name: str
 ) -> tuple[list[_Element], bytes]:
-    plain: list[_Element] = []
-    rows: list[str] = []
+    bodies: list[list[str]] = []
+    faces: dict[int, list[_Row]] = {}
     vertices = _vertex_count(elements)
-    for element in elements:
+    for position, element in enumerate(elements):
         scalars = sum(kind.length is None for kind in element.properties)
         is_face = element.name == "face" and element.size > 0
         lists = _face_lists(element, name) if is_face else []
-        first = len(rows)
+        bodies.append([])
         for k in range(element.size):
             number, words = next_line(lines, f"{element.name} {k}", name, number)
             where = f"{name}:{number}"
@@ -193,18 +213,40 @@ def _plain_text(
                     f" {quote(words)}"
                 )
             if not is_face:
-                rows.append(" ".join(words))
+                bodies[-1].append(" ".join(words))
                 continue
-            row = _text_row(words, element, lists[0], vertices, where)
-            for triangle in _fan(row, lists, where):
-                rows.append(" ".join(f"{len(list_)} {' '.join(list_)}" for list_ in triangle))
-        plain.append(_triangles(len(rows) - first, lists) if is_face else element)
-    return plain, "\n".join([*rows, ""]).encode()
+            row = _text_row(words, element, where, lists[0], vertices)
+            _check_coordinates(row, lists, where)
+            faces.setdefault(position, []).append(row)
+
+    def positions() -> np.ndarray:
+        rows = (
+            _text_row(row.split(), element, name)
+            for element, body in zip(elements, bodies, strict=True)
+            if element.name == "vertex"
+            for row in body
+        )
+        return _positions(rows, name)
+
+    plain = [*elements]
+    for position, rows in faces.items():
+        lists = _face_lists(elements[position], name)
+        bodies[position] = [
+            " ".join(f"{len(values)} {' '.join(values)}" for values in triangle)
+            for triangle in _cut(rows, lists, positions)
+        ]
+        plain[position] = _triangles(len(bodies[position]), lists)
+    return plain, "\n".join([*chain.from_iterable(bodies), ""]).encode()
 
 
 def _text_row(
-    words: list[str], element: _Element, indices: _Property, vertices: int, where: str
+    words: list[str],
+    element: _Element,
+    where: str,
+    indices: _Property | None = None,
+    vertices: int = 0,
 ) -> dict[str, list[str]]:
+    """Values of an element; `indices` is the list of a face's corners, of so many vertices."""
     row: dict[str, list[str]] = {}
     rest = words
     for kind in element.properties:
@@ -213,7 +255,7 @@ def _text_row(
         size = 1 if kind.length is None else to_count(rest[0]) if rest else -1
         rest = rest if kind.length is None else rest[1:]
         if not 0 <= size <= len(rest):
-            raise ValueError(f"{where}: wanted {kind.name} of a face, got {quote(words)}")
+            raise ValueError(f"{where}: wanted {kind.name} of a {element.name}, got {quote(words)}")
         row[kind.name], rest = rest[:size], rest[size:]
     return row
 
@@ -226,38 +268,62 @@ def _plain_binary(
 ) -> tuple[list[_Element], bytes]:
     at = 0
     vertices = _vertex_count(elements)
+    starts: list[int] = []
+    found: tuple[int, int, list[_Row]] | None = None  # faces: their element, their end, and they
     for number, element in enumerate(elements):
-        if element.name == "face" and element.size > 0:
+        starts.append(at)
+        if found is None and element.name == "face" and element.size > 0:
             lists = _face_lists(element, name)
             if _are_triangles(element, body, at, order, lists[0], name):
-                break
-            faces, end = [], at
-            codes = [
-                f"{order}B{size}{_CODES[kind.type]}"
-                for kind, size in zip(lists, (3, 6), strict=False)
-            ]
-            for k in range(element.size):
-                where = f"{name}: face {k}"
-                row, end = _binary_row(element, body, end, order, f"{name}: wanted face {k}")
-                corners = row[lists[0].name]
+                return elements, body
+            rows: list[_Row] = []
+            for row, end in _binary_rows(element, body, at, order, name):
+                corners, where = row[lists[0].name], f"{name}: face {len(rows)}"
                 check_indices([str(value) for value in (len(corners), *corners)], vertices, where)
-                for triangle in _fan(row, lists, where):
-                    faces.append(
-                        b"".join(
-                            struct.pack(code, len(list_), *list_)
-                            for code, list_ in zip(codes, triangle, strict=True)
-                        )
-                    )
-            plain = [*elements]
-            plain[number] = _triangles(len(faces), lists)
-            return plain, body[:at] + b"".join(faces) + body[end:]
-        if any(kind.length is not None for kind in element.properties):
-            for k in range(element.size):
-                _, at = _binary_row(element, body, at, order, f"{name}: wanted {element.name} {k}")
+                _check_coordinates(row, lists, where)
+                rows.append(row)
+                at = end
+            found = number, at, rows
+        elif any(kind.length is not None for kind in element.properties):
+            for _, end in _binary_rows(element, body, at, order, name):
+                at = end
         else:
             row_code = order + "".join(_CODES[kind.type] for kind in element.properties)
             at += element.size * struct.calcsize(row_code)
-    return elements, body
+    if found is None:
+        return elements, body
+
+    def positions() -> np.ndarray:
+        rows = (
+            row
+            for element, start in zip(elements, starts, strict=True)
+            if element.name == "vertex"
+            for row, _ in _binary_rows(element, body, start, order, name)
+        )
+        return _positions(rows, name)
+
+    number, end, rows = found
+    lists = _face_lists(elements[number], name)
+    codes = [f"{order}B{n}{_CODES[kind.type]}" for kind, n in zip(lists, (3, 6), strict=False)]
+    faces = [
+        b"".join(
+            struct.pack(code, len(values), *values)
+            for code, values in zip(codes, triangle, strict=True)
+        )
+        for triangle in _cut(rows, lists, positions)
+    ]
+    plain = [*elements]
+    plain[number] = _triangles(len(faces), lists)
+    return plain, body[: starts[number]] + b"".join(faces) + body[end:]
+
+
+def _binary_rows(
+    element: _Element, body: bytes, at: int, order: str, name: str
+) -> Iterator[tuple[_Row, int]]:
+    """Values of all of an element, each with where they end."""
+    for k in range(element.size):
+        row, at = _binary_row(element, body, at, order, f"{name}: wanted {element.name} {k}")
+        yield row, at
 
 
 def _binary_row(

@@ -2,8 +2,9 @@
 
 Reading goes through trimesh, an optional dependency (`pip install diffrast[mesh]`), told to
 change nothing: no merging, no reordering, no guessing of normals. `diffrast.files._mesh_text`
-and `._ply` check text formats first, cut polygons into fans, and read OFF. Of materials trimesh
-sees only numbers; `diffrast.files._mtl`, `._gltf_materials` and `._ply` read what these are.
+and `._ply` check text formats first, cut polygons into triangles, and read OFF. Of materials
+trimesh sees only numbers; `diffrast.files._mtl`, `._gltf_materials` and `._ply` read what these
+are.
 """
 
 import dataclasses
@@ -61,13 +62,13 @@ class MeshPart(NamedTuple):
 def load_mesh(path: str | Path) -> Mesh:
     """Read a mesh from an OBJ, PLY, STL, OFF, glTF or GLB file.
 
-    Polygons are cut into fans, several geometries are merged in their places. Vertex normals and
-    texture coordinates are those of the file, else `None` (`with_normals` makes smooth normals);
-    where only some geometries have them the others get area-weighted normals, or uv (0, 0). Those
-    of an OBJ file are what shares a material: it has normals or uvs where all its corners have
-    them. An OBJ vertex that occurs with several texture coordinates or normals is split. STL files
-    hold triangles with their own corners and no vertex normals. Points, lines, colours and material
-    files are left out.
+    Polygons are cut into fans, concave ones ear by ear, and several geometries are merged in their
+    places. Vertex normals and texture coordinates are those of the file, else `None`
+    (`with_normals` makes smooth normals); where only some geometries have them the others get
+    area-weighted normals, or uv (0, 0). Those of an OBJ file are what shares a material: it has
+    normals or uvs where all its corners have them. An OBJ vertex that occurs with several texture
+    coordinates or normals is split. STL files hold triangles with their own corners and no vertex
+    normals. Points, lines, colours and material files are left out.
 
     Args:
         path: the file; its suffix names the format.
