@@ -137,7 +137,8 @@ class PointLight:
         ambient: (3,) or None.
         attenuation: (3,) a, b, c: diffuse and specular light is divided by a + b r + c r² at the
             distance r; or an `Attenuation`; None for no attenuation.
-        shadow: how it casts shadows, or None for none.
+        shadow: how it casts shadows, or None for none. From more than some 10^4 times the scene's
+            size away they are wrong in float32: let a `DirectionalLight` cast them.
         incidence_cutoff: None, or an angle in radians, 0 < a_s <= pi / 2: light that arrives at
             the angle a from the normal is reflected diffusely as 1 - (1 - cos a) / (1 - cos a_s)
             instead of cos a, and beyond a_s not at all (the spot of FEATURES S2; Van Houdt A20);
