@@ -788,6 +788,9 @@ def test_a_picture_of_ones_own_gets_its_edges(options, image_error, derivative_e
         ({"background": (1.0, 2.0)}, "background: wanted"),
         ({"topology": dr.shapes.cube().topology}, "topology: wanted that of"),
         ({"creases": "some"}, "creases: wanted one of"),
+        ({"shader": lambda data, face, _: 1.0}, r"shader: wanted shape \(\d+, 3\), got \(\)"),
+        ({"shader": lambda data, face, _: face}, r"shader: wanted shape \(\d+, 3\)"),
+        ({"shader": lambda data, face, _: None}, "shader: wanted an array of numbers"),
     ],
 )
 def test_bad_arguments_of_the_stage_are_named(change, message):

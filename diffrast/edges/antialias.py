@@ -86,16 +86,17 @@ def antialias(
         creases: between which faces, both in view, colours may jump: those that have vertices of
             their own at the common edge ("seams"), any ("all", for flat shading), or "none".
         cull_backfaces: as given to `rasterize`.
-        shader: colours of points on faces, `shader(data, face, barycentrics)`, for exact colours at
-            the edges; it needs no derivative. Without it those of the pixels beside them are
-            taken: several times the error where colours change from pixel to pixel.
+        shader: colours (n, channels) of points on faces, `shader(data, face, barycentrics)`, for
+            exact colours at the edges; it needs no derivative. Without it those of the pixels
+            beside them are taken: several times the error where colours change from pixel to pixel.
         data: a tree of arrays for the shader, which cannot use traced arrays otherwise.
 
     Returns:
         (height, width, channels).
 
     Raises:
-        ValueError: for wrong shapes, indices out of range and an unknown choice.
+        ValueError: for wrong shapes, indices out of range, an unknown choice, and a shader
+            that makes no such colours.
     """
     image = _check.float_array("image", image, ("height + 2", "width + 2", "channels"))
     positions_clip = _check.float_array("positions_clip", positions_clip, ("V", 4))
@@ -141,14 +142,17 @@ def antialias(
         background=background,
         scene=data,
     )
-    own = None if shader is None else _by_columns(shader)
+    own = None if shader is None else _by_columns(shader, image)
     return antialias_image(with_depth(view), shader=own, cull_backfaces=cull_backfaces)
 
 
-def _by_columns(shader: PointShader) -> Shader:
+def _by_columns(shader: PointShader, image: Array) -> Shader:
+    channels, dtype = image.shape[2], image.dtype
+
     def shade(data: Any, face: Array, barycentrics: list[Array], _: Array | None) -> list[Array]:
         colors = shader(data, face, jnp.stack(barycentrics, axis=-1))
-        return [colors[:, c] for c in range(colors.shape[1])]
+        colors = _check.float_array("shader", colors, (face.size, channels)).astype(dtype)
+        return [colors[:, c] for c in range(channels)]
 
     return shade
 
