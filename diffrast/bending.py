@@ -128,7 +128,10 @@ def _least(mean: Array) -> Array:
 
 
 def _places(image: Array) -> int:
-    """For how many pixels of an image there is room."""
+    """For how many pixels of an image there is room; in large ones whole batches, and no more.
+
+    What is known of each is held for the derivative.
+    """
     most = image.size // _SHARE
     if most > PARTS_AT_ONCE:
         return most // PARTS_AT_ONCE * PARTS_AT_ONCE

@@ -105,7 +105,7 @@ class Outlines(NamedTuple):
     places: Places
     face: Int[Array, "faces n"]  # on which the shadows fall
     corners: Float[Array, "3 3 faces n"]  # of them, from the pixel's centre
-    edge: Int[Array, "edges n"]  # 3 * face + corner, as in `Cast`
+    edge: Int[Array, "edges n"]  # 3 * face + corner
     vertices: Int[Array, "2 edges n"]
     ends: Float[Array, "2 3 edges n"]  # of the edges, from the pixel's centre
     source: Float[Array, "3 n"]  # the light, likewise
@@ -201,16 +201,13 @@ def cross_shadows(
     counts = stored(same & cast.turned[light, seen])
     lit = stored(cast.lit[light, row, column])
 
-    between, on_one = decoded(
-        stored(cast.between[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
-    )
+    codes = stored(cast.between[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
+    between, on_one = decoded(codes)
     is_ground = jnp.where(on_one == ON_SECOND, same[_SECOND], same[_FIRST]) & same[4]
     known, between = stored((exists & (between >= 0) & is_ground, between))
     pair, found = _unlike(between, known, _EDGES)
     looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
-    first_column, its_row = pixel[:, None] + 1 + steps_to(looks[0])
-    chosen_pair = light, jnp.asarray(_DIRECTION)[pair], its_row, first_column
-    edge, on_one = stored(decoded(cast.between[chosen_pair]))
+    edge, on_one = stored(decoded(jnp.stack([picked(codes, k) for k in pair])))
     is_second, is_hidden = on_one == ON_SECOND, on_one != ON_BOTH
     home, away = jnp.where(is_second, looks[::-1], looks)
     first_is_lit = jnp.stack([picked(lit, k) for k in home]) != is_second
