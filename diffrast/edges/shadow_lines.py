@@ -57,8 +57,9 @@ from diffrast.edges.shadow_planes import (
     shadow_plane,
 )
 
-ON_BOTH, ON_FIRST, ON_SECOND = range(3)  # which of two pixels show what a shadow falls on; if one
-# does, what the other one shows is nearer, and hides where the shadow begins or ends.
+# Which of two pixels show what a shadow falls on; if one does, what the other one shows is nearer,
+# and hides where the shadow begins or ends.
+ON_BOTH, ON_FIRST, ON_SECOND = np.arange(3, dtype=np.int32)
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
 _NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
