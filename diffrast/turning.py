@@ -134,7 +134,7 @@ def _find(given: _Given, image: Float[Array, "height width 3"]) -> PointsWithin:
         row, column = divided(chosen.number, width)
         lit = jax.tree.map(lambda part: part[row + 1, column + 1], reached)
         face = faces_at(chosen, turning.face_image, clip, faces, topology, apart, volume)
-        return PointsWithin(chosen, number_seen(chosen, face), face, lit)
+        return PointsWithin(chosen, number_seen(chosen, face), turning.face_image, face, lit)
 
     seen = lax.stop_gradient((given.fixed, image, drawn.positions_clip, drawn.faces))
     return over_views(find, image.shape[0] * width)(*seen)

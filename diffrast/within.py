@@ -46,7 +46,8 @@ class PointsWithin(NamedTuple):
 
     chosen: Chosen
     seen: Int[Array, " places"]  # points of each where this surface is seen
-    face: Int[Array, "points parts"]  # -1 where the surface ends, or is hidden
+    face_image: Int[Array, "height_with_border width_with_border"]  # what is at their centres, and
+    face: Int[Array, "points_but_one parts"]  # at others; -1: the surface ends there, or is hidden
     reached: Reached  # at their centres: whatever shadow begins within a pixel has its edge
 
 
@@ -87,8 +88,8 @@ def faces_at(
     topology: Topology,
     apart: Array,
     volume: Array,
-) -> Int[Array, "points parts"]:
-    """The faces at the points of pixels, found from those at their centres.
+) -> Int[Array, "points_but_one parts"]:
+    """The faces at the points of pixels but their centres, found from those at these.
 
     What the next pixels show may hide them.
     """
@@ -105,16 +106,15 @@ def faces_at(
             row, column = stored(divided(chosen.number[place], width - 2))
             x0, y0 = (at.astype(clip.dtype) + 1.5 for at in (column, row))
             centre = stored(jnp.where(exists, face_image[row + 1, column + 1], -1))
-            right, down = stored(jnp.asarray(POINTS, clip.dtype)[:, :, part])
+            right, down = stored(jnp.asarray(POINTS[:, 1:], clip.dtype)[:, :, part])
             point = x, y = stored_together((x0 + right, y0 + down))
             covered = covers(edge_values(corners_of(centre, faces, pixels)[:, :, None], x, y)[0])
-            covered = covered | (jnp.arange(x.shape[0]) == 0)[:, None]
             own = jnp.broadcast_to(centre, x.shape)
             # Beyond a fold, to which a way might lead round its end, edges tell what is seen.
             start = stored(jnp.where(covered, -1, own))
             ends, there = walk(start, x, y, surface, straight=True)
             seen = stored(jnp.where(covered, own, jnp.where(there, ends, -1)))
-            right, down = stored(jnp.asarray(_ASIDE)[:, :, part])
+            right, down = stored(jnp.asarray(_ASIDE[:, 1:])[:, :, part])
             beside = stored(face_image[row + 1 + down, column + 1 + right])
             parted = exists & (place >= chosen.plain)
             beside = stored(jnp.where(parted & (beside != own), beside, -1))
@@ -124,18 +124,18 @@ def faces_at(
 
         return over_parts(chosen, count, add, found)
 
-    nowhere = jnp.full((POINTS.shape[1], chosen.number.size), -1, jnp.int32)
+    nowhere = jnp.full((POINTS.shape[1] - 1, chosen.number.size), -1, jnp.int32)
     nowhere = nowhere + varying_zero((chosen, face_image, clip, faces, topology, apart, volume))
     return lax.cond(anywhere(count > 0), find, lambda nowhere: nowhere, nowhere)
 
 
 def _unhidden(
-    seen: Int[Array, "points parts"],
-    beside: Int[Array, "points parts"],
+    seen: Int[Array, "points_but_one parts"],
+    beside: Int[Array, "points_but_one parts"],
     point: tuple[Array, Array],
     centre: tuple[Array, Array],
     surface: Surface,
-) -> Int[Array, "points parts"]:
+) -> Int[Array, "points_but_one parts"]:
     """What is seen at points, -1 where the surface that the next pixel shows lies before that.
 
     It does not if at that pixel's centre it lies behind the plane of what is seen at the point.
@@ -180,15 +180,18 @@ def _parted(topology: Topology, apart: Array) -> Array:
     return _together(topology, apart).at[face, side].set(-1, mode="drop")
 
 
-def number_seen(chosen: Chosen, face: Int[Array, "points parts"]) -> Int[Array, " places"]:
+def number_seen(chosen: Chosen, face: Int[Array, "points_but_one parts"]) -> Int[Array, " places"]:
     """At how many points of each pixel its surface is seen, without the centres."""
     place, _ = place_of(chosen, jnp.arange(face.shape[1], dtype=jnp.int32))
-    of_parts = stored(jnp.sum(face[1:] >= 0, axis=0, dtype=jnp.int32))
+    of_parts = stored(jnp.sum(face >= 0, axis=0, dtype=jnp.int32))
     seen = jnp.zeros(chosen.number.size, jnp.int32).at[place].add(of_parts)
     return stored(seen.astype(jnp.int8))
 
 
 def faces_of(points: PointsWithin, parts: Parts, n: Array) -> Int[Array, "points some"]:
-    """The faces at the points of parts of the batch `n`."""
+    """The faces at the points of parts of the batch `n`, those at the centres first."""
     some = parts.place.size
-    return lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
+    row, column = divided(points.chosen.number[parts.place], points.face_image.shape[1] - 2)
+    centre = jnp.where(parts.exists, points.face_image[row + 1, column + 1], -1)
+    others = lax.dynamic_slice_in_dim(points.face, n * some, some, 1)
+    return stored(jnp.concatenate([centre[None], others]))
