@@ -375,6 +375,38 @@ def test_edges_on_borders_and_through_centres_of_pixels_bound_their_exact_area(c
     np.testing.assert_allclose(np.ravel(got), want, atol=1e-4)
 
 
+@jax.jit
+def white_triangle(corners):
+    """The share of 24 × 24 pixels that it covers, its corners in pixels."""
+    x, y = corners[:, 0] / 12 - 1, 1 - corners[:, 1] / 12
+    clip, faces = jnp.stack([x, y, 0 * x, jnp.ones_like(x)], axis=1), jnp.array([[0, 1, 2]])
+    face = dr.rasterize(clip, faces, height=24, width=24, border=1).face
+
+    def white(_, face, barycentrics):
+        return jnp.where(face >= 0, 1.0, 0.0)[:, None]
+
+    image = white(None, face.reshape(-1), None).reshape(26, 26, 1)
+    return dr.antialias(image, clip, faces, face, shader=white)[..., 0]
+
+
+@pytest.mark.parametrize("width", [3e-4, 1e-3, 2e-3, 4e-3])
+def test_needles_through_centres_of_pixels_fill_none(width):
+    """Thinner than vertices move on the rasteriser's grid, which may have it beyond either edge."""
+    random = np.random.default_rng(3)
+    for _ in range(60):
+        centre, angle = random.integers(4, 20, 2) + 0.5, random.uniform(0, 2 * np.pi)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        before, after = random.uniform(1, 12, 2)
+        middle = centre + random.uniform(-width, width) * across
+        wide = width * (before + after) / before
+        base = middle + after * along + random.uniform() * width * across
+        corners = np.array([middle - before * along, base, base - wide * across], np.float32)
+        image = white_triangle(corners[:: random.choice([-1, 1])])
+        assert image.min() > -1e-4
+        assert image.max() < 2 * wide
+
+
 def test_bodies_that_pierce_on_borders_and_through_centres_of_pixels_part_their_exact_area():
     """A slope rises out of level ground along a column of pixels, in its middle or beside it."""
     corners = np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [9.0, 9.0, 0.0], [-9.0, 9.0, 0.0]])

@@ -109,10 +109,11 @@ def look(
     `shadowed` is whether lights cast shadows.
     """
     faces, pixels, topology, volume = surface
-    own, own_corners, weights, *ends, fold, first_on_right = stored_together(
+    own, own_corners, vertices, weights, *ends, fold, first_on_right = stored_together(
         (
             segments.faces[:, pieces.segment],
             segments.corners[:, pieces.segment],
+            segments.vertices[:, pieces.segment],
             segments.weights[:, pieces.segment],
             *segments.ends[..., pieces.segment],
             segments.fold[pieces.segment],
@@ -231,9 +232,13 @@ def look(
     wrong_side = fold & (pictured[4] >= 0) & (pictured[4] == other)
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
-    close = (jnp.abs(to_right) < SNAPPED) & (is_beyond != 0)
     least = jnp.array(_TIE[1], near.dtype)
     told = (outward * is_beyond).astype(near.dtype)  # the sign of `to_right`
+    # A centre may lie beyond either edge of a needle, as the rasteriser has them, not beyond both.
+    side = _snapped_side(stored(pixels[:, vertices]), centre, face_image.shape)
+    needle = (thickness < 2 * SNAPPED) & (is_beyond >= 0)
+    told = jnp.where(needle & (side != 0), jnp.sign(side), told)
+    close = (jnp.abs(to_right) < SNAPPED) & (told != 0)
     # Of an edge that ends before the centre the one beyond its corner tells.
     ends_before = (at_end[0] & (dot_rows(begin, along) > 0)) | (
         at_end[1] & (dot_rows(end, along) < 0)
@@ -366,15 +371,31 @@ def _near(point: Array) -> Bool[Array, " n"]:
     return dot_rows(point, point) < _BY**2
 
 
-def _snap(vertex: Float[Array, "2 n"], shape: tuple[int, ...]) -> Float[Array, "2 n"]:
+def _snap(vertex: Float[Array, "2 *n"], shape: tuple[int, ...]) -> Float[Array, "2 *n"]:
     """From where a vertex near a pixel's centre is to where the rasteriser has it.
 
     That is on a grid, and a centre on an edge belongs to what is on the right of it, or else below.
     So all edges that meet at a centre agree on which side that is.
     """
     steps = float(1 << subpixel_bits(*shape))
-    tie = jnp.array(_TIE, vertex.dtype)[:, None]
+    tie = jnp.array(_TIE, vertex.dtype).reshape(2, *[1] * (vertex.ndim - 1))
     return jnp.round(vertex * steps) / steps - vertex - tie
+
+
+def _snapped_side(
+    ends: Float[Array, "3 2 n"], centre: Float[Array, "2 n"], shape: tuple[int, ...]
+) -> Float[Array, " n"]:
+    """How far centres lie to the right of edges as the rasteriser has them, times any length.
+
+    Zero where an end is behind the camera.
+    """
+    x, y, w = ends
+    inverse_w = 1 / jnp.where(w > 0, w, 1)
+    vertex = jnp.stack([x * inverse_w, y * inverse_w])
+    snapped = vertex + _snap(vertex, shape) - centre[:, None]
+    (start_x, end_x), (start_y, end_y) = snapped
+    side = start_y * end_x - start_x * end_y
+    return jnp.where((w[0] > 0) & (w[1] > 0), side, 0)
 
 
 def _thickness(apex: Array, start: Array, normal: Array, length: Array, t: Array) -> Array:
