@@ -27,7 +27,7 @@ def interpolate(
     Args:
         attributes: (V, C) values at the vertices.
         faces: (F, 3) the faces that were rasterised.
-        fragments: result of `rasterize`.
+        fragments: result of `rasterize`, of these faces.
 
     Returns:
         (height, width, C) values, 0 on the background. Differentiable in `attributes` and in the
@@ -46,16 +46,23 @@ def interpolate(
     instance_of("fragments", fragments, Fragments)
     attributes = float_array("attributes", attributes, ("V", "C"), finite=False)
     faces = index_array("faces", faces, ("F", 3), bound=attributes.shape[0])
+    face = _face_of(fragments, faces)
     barycentrics = [fragments.barycentrics[..., j] for j in range(3)]
     if attributes.shape[1] == 0:
-        return jnp.zeros((*fragments.face.shape, 0), attributes.dtype)
+        return jnp.zeros((*face.shape, 0), attributes.dtype)
     columns = interpolate_columns(
         [attributes[:, c] for c in range(attributes.shape[1])],
         faces,
-        fragments.face,
+        face,
         barycentrics,
     )
     return assemble(columns)
+
+
+def _face_of(fragments: Fragments, faces: Int[Array, "F 3"]) -> Int[Array, "height width"]:
+    """What the pixels show, if these faces can have been drawn."""
+    size = ("height", "width")
+    return index_array("fragments.face", fragments.face, size, minimum=-1, bound=faces.shape[0])
 
 
 def interpolate_columns(
@@ -100,7 +107,7 @@ def screen_derivatives(
     positions_clip = float_array("positions_clip", positions_clip, (count, 4), finite=False)
     faces = index_array("faces", faces, ("F", 3), bound=count)
     border = positive_int("border", border, minimum=0)
-    face = fragments.face
+    face = _face_of(fragments, faces)
     height, width = (size - 2 * border for size in face.shape)
     slopes = face_slopes(attributes, faces, positions_clip, faces, height, width)
     barycentrics = [fragments.barycentrics[..., j] for j in range(3)]

@@ -107,6 +107,7 @@ def test_vmap_over_attributes(drawn):
         ({"faces": [[0, 1]]}, r"faces: wanted shape \(F, 3\), got \(1, 2\)"),
         ({"faces": [[0, 1, 3]]}, r"faces: wanted indices in \[0, 3\), got 3"),
         ({"faces": [[0.0, 1.0, 2.0]]}, "faces: wanted integers"),
+        ({"faces": np.zeros((0, 3), int)}, r"fragments.face: wanted indices in \[-1, 0\), got 0"),
     ],
 )
 def test_bad_input(change, message):
