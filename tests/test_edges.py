@@ -376,10 +376,11 @@ def test_edges_on_borders_and_through_centres_of_pixels_bound_their_exact_area(c
 
 
 @jax.jit
-def white_triangle(corners):
-    """The share of 24 × 24 pixels that it covers, its corners in pixels."""
+def white_strip(corners):
+    """The share of 24 × 24 pixels that two triangles cover, their four corners in pixels."""
     x, y = corners[:, 0] / 12 - 1, 1 - corners[:, 1] / 12
-    clip, faces = jnp.stack([x, y, 0 * x, jnp.ones_like(x)], axis=1), jnp.array([[0, 1, 2]])
+    clip = jnp.stack([x, y, 0 * x, jnp.ones_like(x)], axis=1)
+    faces = jnp.array([[0, 1, 2], [0, 2, 3]])
     face = dr.rasterize(clip, faces, height=24, width=24, border=1).face
 
     def white(_, face, barycentrics):
@@ -389,9 +390,13 @@ def white_triangle(corners):
     return dr.antialias(image, clip, faces, face, shader=white)[..., 0]
 
 
+@pytest.mark.parametrize("ends", [0.0, 0.7])
 @pytest.mark.parametrize("width", [3e-4, 1e-3, 2e-3, 4e-3])
-def test_needles_through_centres_of_pixels_fill_none(width):
-    """Thinner than vertices move on the rasteriser's grid, which may have it beyond either edge."""
+def test_needles_through_centres_of_pixels_fill_none(width, ends):
+    """Thinner than vertices move on the rasteriser's grid, which may have them beyond either edge.
+
+    One end is as wide as `ends` times the other.
+    """
     random = np.random.default_rng(3)
     for _ in range(60):
         centre, angle = random.integers(4, 20, 2) + 0.5, random.uniform(0, 2 * np.pi)
@@ -400,11 +405,12 @@ def test_needles_through_centres_of_pixels_fill_none(width):
         before, after = random.uniform(1, 12, 2)
         middle = centre + random.uniform(-width, width) * across
         wide = width * (before + after) / before
-        base = middle + after * along + random.uniform() * width * across
-        corners = np.array([middle - before * along, base, base - wide * across], np.float32)
-        image = white_triangle(corners[:: random.choice([-1, 1])])
+        first, last = middle - before * along, middle + after * along
+        last = last + random.uniform() * width * across
+        corners = [first, first + ends * wide * across, last, last - wide * across]
+        image = white_strip(np.array(corners, np.float32)[:: random.choice([-1, 1])])
         assert image.min() > -1e-4
-        assert image.max() < 2 * wide
+        assert image.max() < 3 * wide
 
 
 def test_bodies_that_pierce_on_borders_and_through_centres_of_pixels_part_their_exact_area():

@@ -232,12 +232,15 @@ def look(
     wrong_side = fold & (pictured[4] >= 0) & (pictured[4] == other)
     nearer = (pictured[4] == front) | wrong_side
     is_beyond = jnp.where(nearer, -1, jnp.where(farther, 1, 0))
+    # Of a needle the centre may show another face as near, and may lie beyond either edge as the
+    # rasteriser has them, but not beyond both.
+    needle = thickness < 2 * SNAPPED
+    same = fold & (pictured[4] >= 0) & (patch[4] == front_patch)
+    is_beyond = jnp.where(needle & same & (is_beyond == 0), -1, is_beyond)
     least = jnp.array(_TIE[1], near.dtype)
     told = (outward * is_beyond).astype(near.dtype)  # the sign of `to_right`
-    # A centre may lie beyond either edge of a needle, as the rasteriser has them, not beyond both.
     side = _snapped_side(stored(pixels[:, vertices]), centre, face_image.shape)
-    needle = (thickness < 2 * SNAPPED) & (is_beyond >= 0)
-    told = jnp.where(needle & (side != 0), jnp.sign(side), told)
+    told = jnp.where(needle & (is_beyond >= 0) & (side != 0), jnp.sign(side), told)
     close = (jnp.abs(to_right) < SNAPPED) & (told != 0)
     # Of an edge that ends before the centre the one beyond its corner tells.
     ends_before = (at_end[0] & (dot_rows(begin, along) > 0)) | (
@@ -335,8 +338,8 @@ def look(
     is_beyond = shows & (beyond_look == 4) & alike
 
     # A flap of a curved surface, narrower than a pixel, in front of that surface itself.
-    same = picked(patch, beyond_look) == front_patch
-    flap = fold & ~rim.smooth & (beyond == -1) & same
+    folded = picked(patch, beyond_look) == front_patch
+    flap = fold & ~rim.smooth & (beyond == -1) & folded
     seen = Seen(
         visible=visible & ~flap,
         fold=fold,
