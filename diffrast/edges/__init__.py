@@ -4,4 +4,4 @@ from diffrast.edges.antialias import antialias as antialias
 from diffrast.edges.antialias import antialias_image as antialias_image
 from diffrast.edges.antialias import with_depth as with_depth
 from diffrast.edges.blend import View as View
-from diffrast.edges.shadow_lines import Cast as Cast
+from diffrast.edges.shadow_pairs import Cast as Cast

@@ -19,7 +19,7 @@ from diffrast.edges.blend import Blended, Glow, Method, Shader, View, with_sums
 from diffrast.edges.collect import collect
 from diffrast.edges.derivative import ROWS_AT_ONCE, apply_linear
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
-from diffrast.edges.shadow_lines import with_lights
+from diffrast.edges.shadow_pairs import with_lights
 from diffrast.edges.survey import survey
 from diffrast.raster.evaluate import unit_of
 

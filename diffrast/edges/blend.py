@@ -21,7 +21,8 @@ from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
 from diffrast.edges.rim import BESIDE
-from diffrast.edges.shadow_lines import Cast, Shadow, light_told
+from diffrast.edges.shadow_lines import Shadow
+from diffrast.edges.shadow_pairs import Cast, light_told
 from diffrast.edges.unseen import Survey
 from diffrast.edges.visibility import BACKGROUND, SNAPPED, Seen
 

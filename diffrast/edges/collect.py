@@ -28,8 +28,9 @@ from diffrast.edges.piercing import LINES_AT_ONCE, PIXELS_AT_ONCE, choose_pixels
 from diffrast.edges.records import Start, after_batch, has_room
 from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
 from diffrast.edges.shadow_lines import PIXELS_AT_ONCE as SHADOWED_AT_ONCE
-from diffrast.edges.shadow_lines import Cast, Places, cross_shadows, shadow_of
-from diffrast.edges.shadow_lines import choose_pixels as choose_shadowed
+from diffrast.edges.shadow_lines import Places, cross_shadows, shadow_of
+from diffrast.edges.shadow_pairs import Cast
+from diffrast.edges.shadow_pairs import choose_pixels as choose_shadowed
 from diffrast.edges.survey import Edges, surface_of
 from diffrast.edges.visibility import look
 from diffrast.edges.waiting import Waiting, first_ones, instead_of_first

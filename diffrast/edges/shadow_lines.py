@@ -11,19 +11,17 @@ the shadow plane move, what it says of a point M = α light + β start + γ end 
 the point seen at a place of the screen moves along the line of sight.
 """
 
-import itertools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
 from diffrast.edges.neighborhood import Surface, first_row, picked, pixels_round, steps_to, walk
-from diffrast.edges.pieces import Depth, positive_part
+from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import (
     Columns,
     barycentrics,
@@ -45,6 +43,16 @@ from diffrast.edges.shadow_ends import (
     uncovered,
 )
 from diffrast.edges.shadow_overlap import Lines, left_by_others, overlap
+from diffrast.edges.shadow_pairs import (
+    DIRECTION,
+    FIRST,
+    NEAREST,
+    ON_BOTH,
+    ON_SECOND,
+    SECOND,
+    Cast,
+    decoded,
+)
 from diffrast.edges.shadow_planes import (
     Plane,
     behind_edge,
@@ -57,39 +65,12 @@ from diffrast.edges.shadow_planes import (
     shadow_plane,
 )
 
-# Which of two pixels show what a shadow falls on; if one does, what the other one shows is nearer,
-# and hides where the shadow begins or ends.
-ON_BOTH, ON_FIRST, ON_SECOND = np.arange(3, dtype=np.int32)
 PIXELS_AT_ONCE = 512
 LINES_AT_ONCE = 256
-_NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
-_PLACE = np.argsort(_NEAREST)  # of pixels among these,
-_CROSS = 5  # of which the first so many are the middle one and the four next to it
 _EDGES = 4  # whose shadows part a pixel, at most,
 _FACES = 4  # on so many faces
 _BESIDE = 0.25  # pixels: how far beyond two of them a line may pass that parts them
 _EDGE_ON = 1e-4  # of its size: how far a face reaches out of the plane through light and edge
-
-# Neighbours among the 3×3 pixels, those of the middle one first: direction, first, second.
-_RIGHT = [(0, 3 * row + k, 3 * row + k + 1) for row, k in itertools.product(range(3), range(2))]
-_BELOW = [(1, 3 * row + k, 3 * row + k + 3) for row, k in itertools.product(range(2), range(3))]
-_DIRECTION, _FIRST, _SECOND = np.array(
-    sorted(_RIGHT + _BELOW, key=lambda pair: 4 not in pair[1:]), np.int32
-).T
-
-
-class Cast(NamedTuple):
-    """The shadows of a scene, by their lights."""
-
-    between: Int[Array, "lights 2 height_with_border width_with_border"]
-    # `coded`: the edge whose shadow passes between a pixel and the one on its right, or below it;
-    # -1 if there is none.
-    lit: Bool[Array, "lights height_with_border width_with_border"]
-    patches: Int[Array, " F"]  # the surfaces on which they fall, see `Topology`
-    turned: Bool[Array, "lights F"]  # faces that turn their outside to the light
-    source: Float[Array, "lights 4"]  # clip position, or direction to the light
-    weight: Float[Array, " lights"]  # h: 1 for places, 0 for directions; see `with_lights`
-    parallel: Bool[Array, ""]  # whether the weight moves with the light
 
 
 class Places(NamedTuple):
@@ -140,43 +121,6 @@ class Shadow(NamedTuple):
     motion: Float[Array, "4 6 n"]  # area on the right with x, y and w of these
 
 
-def with_lights(
-    cast: Cast, depth: Depth, unit: Float[Array, ""]
-) -> tuple[Cast, Float[Array, "rows 4"]]:
-    """Shadows as this projection has them, and what follows the vertices' positions.
-
-    First the lights, in such units, then their weights in the place of w, so that they may move.
-    """
-    weight = jnp.where(depth.parallel, depth.weight(cast.source), cast.weight)
-    rows = jnp.zeros_like(cast.source).at[:, 3].set(weight)
-    cast = cast._replace(weight=weight, parallel=depth.parallel)
-    return cast, jnp.concatenate([cast.source / unit, rows])
-
-
-def coded(edge: Int[Array, "*n"], ground: Int[Array, "*n"]) -> Int[Array, "*n"]:
-    """One number of edges, 3 * face + corner, and the pixels that show what their shadow falls on.
-
-    -1 where there is no edge.
-    """
-    return jnp.where(edge < 0, -1, 3 * edge + ground)
-
-
-def decoded(code: Int[Array, "*n"]) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]:
-    """Edges and pixels of such numbers."""
-    edge, ground = divided(jnp.maximum(code, 0), 3)
-    return jnp.where(code < 0, -1, edge), ground
-
-
-def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
-    """Indices (light, row, column) of pixels round which an outline passes, and how many."""
-    right, below = (cast.between[:, k] >= 0 for k in range(2))
-    right = right[:, :-2] | right[:, 1:-1] | right[:, 2:]
-    below = below[:, :-2] | below[:, 1:-1]
-    right = right[:, :, :-2] | right[:, :, 1:-1]
-    below = below[:, :, :-2] | below[:, :, 1:-1] | below[:, :, 2:]
-    return selected(right | below)
-
-
 @jax.jit
 def cross_shadows(
     places: Places,
@@ -202,12 +146,12 @@ def cross_shadows(
     counts = stored(same & cast.turned[light, seen])
     lit = stored(cast.lit[light, row, column])
 
-    codes = stored(cast.between[light, _DIRECTION[:, None], row[_FIRST], column[_FIRST]])
+    codes = stored(cast.between[light, DIRECTION[:, None], row[FIRST], column[FIRST]])
     between, on_one = decoded(codes)
-    is_ground = jnp.where(on_one == ON_SECOND, same[_SECOND], same[_FIRST]) & same[4]
+    is_ground = jnp.where(on_one == ON_SECOND, same[SECOND], same[FIRST]) & same[4]
     known, between = stored((exists & (between >= 0) & is_ground, between))
     pair, found = _unlike(between, known, _EDGES)
-    looks = jnp.stack([jnp.asarray(_FIRST)[pair], jnp.asarray(_SECOND)[pair]])
+    looks = jnp.stack([jnp.asarray(FIRST)[pair], jnp.asarray(SECOND)[pair]])
     edge, on_one = stored(decoded(jnp.stack([picked(codes, k) for k in pair])))
     is_second, is_hidden = on_one == ON_SECOND, on_one != ON_BOTH
     home, away = jnp.where(is_second, looks[::-1], looks)
@@ -224,8 +168,8 @@ def cross_shadows(
         return joined, stored(goes_on)
 
     joined, joins = beside(seen[4])
-    near = jnp.concatenate([shown[4:5], joined, shown[_NEAREST[1:]]])
-    falls = jnp.concatenate([counts[4:5], joins & counts[4], counts[_NEAREST[1:]]])
+    near = jnp.concatenate([shown[4:5], joined, shown[NEAREST[1:]]])
+    falls = jnp.concatenate([counts[4:5], joins & counts[4], counts[NEAREST[1:]]])
     which, received = _unlike(near, falls, _FACES)
     ground_face = jnp.stack([picked(near, k) for k in which])
     is_own = received & (ground_face == own)
@@ -450,40 +394,6 @@ def shadow_of(
     )
 
 
-@jax.jit
-def light_told(
-    cast: Cast,
-    face_image: Int[Array, "height_with_border width_with_border"],
-    pixel: Int[Array, "2 n"],
-    face: Int[Array, " n"],
-) -> tuple[Int[Array, "lights n"], Int[Array, "lights n"]]:
-    """Whether lights reach faces at pixels, as far as these and the four next to them tell.
-
-    1 or 0 where all those agree that show the same surface, turned to the light; else -1. Between
-    them no outline is known, so a ray to the light would tell of a strip that no centre shows. Also
-    what all of the 3×3 pixels tell, -2 where none of these shows it so.
-    """
-    column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(_NEAREST))[..., None]
-    shown = stored(face_image[row, column])
-    seen, face = jnp.maximum(shown, 0), jnp.maximum(face, 0)
-    same = (shown >= 0) & (cast.patches[seen] == cast.patches[face])
-    counts = same & cast.turned[:, seen]
-    lit = cast.lit[:, row, column]
-    # Whether a shadow may begin, on what the middle pixel shows, behind what others do.
-    first, second = _PLACE[_FIRST], _PLACE[_SECOND]
-    _, ground = decoded(cast.between[:, _DIRECTION[:, None], row[first], column[first]])
-    hidden = ((ground == ON_FIRST) & same[first]) | ((ground == ON_SECOND) & same[second])
-    hidden = jnp.any(hidden, axis=1) & same[0]
-
-    def told(rows: int) -> Array:
-        bright, dark = (jnp.any((counts & part)[:, :rows], axis=1) for part in (lit, ~lit))
-        alike = jnp.where(bright, jnp.where(dark, -1, 1), jnp.where(dark, 0, -2))
-        alike = jnp.where(hidden, -1, alike)
-        return jnp.where(cast.turned[:, face], alike, 0)
-
-    return stored((jnp.maximum(told(_CROSS), -1), told(len(_NEAREST))))
-
-
 def _before(
     pixel: Int[Array, "2 n"],
     edge: Int[Array, " n"],
@@ -501,7 +411,7 @@ def _before(
     faces, pixels, topology, volume = surface
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
     at_edge = jnp.stack([caster, topology.neighbors[caster, third]])
-    around = stored(pixels_round(face_image, *pixel))[_NEAREST[1:]]
+    around = stored(pixels_round(face_image, *pixel))[NEAREST[1:]]
     others = jnp.concatenate([around, at_edge, covering])
     there = jnp.maximum(others, 0)
     hides = (others >= 0) & (volume[there] != 0) & (cast.patches[there] != cast.patches[face])

@@ -22,22 +22,14 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int, Shaped
 
-from diffrast._device import anywhere, in_strides, lanes, over_views
+from diffrast._device import anywhere, lanes, over_views
 from diffrast._selection import divided, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.neighborhood import Surface, first_row, picked, walk
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
-from diffrast.edges.planes import (
-    Table,
-    barycentrics,
-    corners_of,
-    edge_functions,
-    edge_values,
-    largest,
-    lowest,
-)
-from diffrast.edges.shadow_lines import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded
+from diffrast.edges.planes import Table, barycentrics, corners_of, edge_functions, edge_values
+from diffrast.edges.shadow_pairs import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.raster.evaluate import unit_of
@@ -45,15 +37,12 @@ from diffrast.shadows.cast import Shadows, by_resolution, shone_on
 from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import Rays, face_corners, faces_near, line_of, seen_by_light
 from diffrast.shadows.views import cube_side, sides
+from diffrast.shadows.ways import covering, follow, leaves
 
 _AT_ONCE = 256
-_STEPS = 64  # from face to face
-_EDGE_ON = 8  # roundings in the volume of a face
 _LOOKS = 8  # from one outline to the next
 _BEYOND = 1 / 64  # of the way from an outline to what is lit: where the next one is looked for
 
-_Search = tuple[Array, Array, Array, Array, Array]
-_State = tuple[Array, Array, Array, Array, Array, Array, Array]
 _Look = tuple[Array, Rays, Array]
 
 
@@ -302,7 +291,7 @@ def _edge_between(
         way = [[rays.x, rays.y], ends[1]]
         line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
         nearby = faces_near(pictures, geometry, rays, line)
-        part, _, volume = _leaves(stored(seen(nearby.corners)), way)
+        part, _, volume = leaves(stored(seen(nearby.corners)), way)
         part = jnp.where((nearby.cut.stops > 0) & (volume != 0) & (part < 2), part, -1)
         part = stored(part)
         farthest = jnp.max(part, axis=0)
@@ -312,14 +301,14 @@ def _edge_between(
         # At a guessed end, where the way ends, too, only whether anything hides the light counts.
         at_end = rays.asked & guessed[1] & (looks > 0) & jnp.any(nearby.cut.stops > 0, axis=0)
         face = jnp.where(hidden, picked(nearby.face, row), -1)
-        face = _covering(face, farthest < 0, topology.neighbors, corners_of, way[0])
-        following, end = _follow(face, topology.neighbors, corners_of, way)
+        face = covering(face, farthest < 0, topology.neighbors, corners_of, way[0])
+        following, end = follow(face, topology.neighbors, corners_of, way)
 
         # What hides the light there may end where something else still does.
         end = end + _BEYOND * (1 - end)
         x, y = (a + end * (b - a) for a, b in zip(*way, strict=True))
         goes_on = following >= 0
-        ground = _covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
+        ground = covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
         shares = jnp.stack(barycentrics(edge_functions(corners_of(ground), x, y)[0]))
         goes_on = goes_on & (guessed[1] | (jnp.min(shares, axis=0) >= 0))
         shares = jnp.where(guessed[1], jnp.stack(bright.barycentrics), shares)
@@ -351,95 +340,3 @@ def _picture(lamps: _Lamps, lamp: Int[Array, " n"], offset: Float[Array, "3 n"])
     """Which picture shows points, given from their lights."""
     side = jnp.where(jnp.asarray(lamps.cube)[lamp], cube_side(list(offset)), 0)
     return jnp.asarray(lamps.first, jnp.int32)[lamp] + side
-
-
-def _leaves(
-    corners: Float[Array, "3 3 *n"], ends: list[list[Array]]
-) -> tuple[Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
-    """Where on the way between two points, 0 to 1, a face ends; 3 if it does not.
-
-    Also the corner opposite to the edge there, and the volume of the face, whose sign tells which
-    side it turns to the light; zero if the light sees it edge-on, as far as rounding can tell.
-    """
-    (first, volume), (last, _) = (edge_functions(corners, *end) for end in ends)
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    extent = jnp.maximum(largest(one), largest(other))
-    place = largest(corners.swapaxes(0, 1))
-    size = jnp.maximum(place[0], place[1]) * place[2] * extent
-    volume = jnp.where(abs(volume) > _EDGE_ON * jnp.finfo(size.dtype).eps * size, volume, 0)
-    sign = jnp.where(volume < 0, -1, 1)
-    parts = []
-    for a, b in zip(first, last, strict=True):
-        a, b = jnp.maximum(a * sign, 0), b * sign
-        parts.append(jnp.where(b < 0, a / jnp.where(b < 0, a - b, 1), 3))
-    return stored((*lowest(parts), volume))
-
-
-def _covering(
-    face: Int[Array, " n"],
-    searched: Bool[Array, " n"],
-    neighbors: Int[Array, "F 3"],
-    corners_of: Callable[[Array], Array],
-    end: list[Array],
-) -> Int[Array, " n"]:
-    """The face of the same surface that hides a point, where one is searched for; or the same."""
-
-    def step(state: _Search) -> _Search:
-        steps, there, turn, goes, found = state
-        values, volume = edge_functions(corners_of(there), *end)
-        sign = jnp.sign(volume)
-        goes = goes & (there >= 0) & ((turn == 0) | (sign == turn))
-        least, corner = lowest([value * sign for value in values])
-        arrives = goes & (least >= 0)
-        following = neighbors[jnp.maximum(there, 0), corner]
-        goes_on = goes & ~arrives
-        found = jnp.where(arrives, there, found)
-        return stored((steps + 1, jnp.where(goes_on, following, there), sign, goes_on, found))
-
-    def is_on_the_way(state: _Search) -> Array:
-        return anywhere((state[0] < _STEPS) & jnp.any(state[3]))
-
-    zero = jnp.zeros_like(end[0])
-    start = jnp.sum(jnp.zeros_like(face)), face, zero, searched & (face >= 0), face
-    return lax.while_loop(is_on_the_way, in_strides(step), start)[-1]
-
-
-def _follow(
-    face: Int[Array, " n"],
-    neighbors: Int[Array, "F 3"],
-    corners_of: Callable[[Array], Array],
-    ends: list[list[Array]],
-) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """The edge at which the surface ends, or turns away, on the way from a face; and where, 0 to 1.
-
-    The edge is -1 where none is found.
-    """
-
-    def step(state: _State) -> _State:
-        steps, face, edge, end, turn, found, done = state
-        part, corner, volume = _leaves(corners_of(face), ends)
-        turned = (edge >= 0) & (volume * turn <= 0)
-        found = found | (~done & ((face < 0) | turned) & (edge >= 0))
-        done = done | found | (face < 0) | (part > 1)
-        following = neighbors[jnp.maximum(face, 0), corner]
-        next_edge = jnp.where(done, edge, 3 * face + corner)
-        end, turn = jnp.where(done, jnp.stack([end, turn]), jnp.stack([part, jnp.sign(volume)]))
-        face = jnp.where(done, face, following)
-        return stored((steps + 1, face, next_edge, end, turn, found, done))
-
-    def is_on_the_way(state: _State) -> Array:
-        return anywhere((state[0] < _STEPS) & ~jnp.all(state[-1]))
-
-    nothing, zero = jnp.zeros_like(face), jnp.zeros_like(ends[0][0])
-    start = jnp.sum(nothing), face, nothing - 1, zero, zero, face < -1, face < 0
-    _, _, edge, end, _, found, _ = lax.while_loop(is_on_the_way, in_strides(step), start)
-    return stored((jnp.where(found, _named_once(edge, neighbors), -1), end))
-
-
-def _named_once(edge: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, " n"]:
-    """Edges by the lower one of their two faces."""
-    face, corner = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
-    other = neighbors[face, corner]
-    back = neighbors[jnp.maximum(other, 0)] == face[:, None]
-    corner = jnp.where(back[:, 0], 0, jnp.where(back[:, 1], 1, 2))
-    return jnp.where((other >= 0) & (other < face), 3 * other + corner, edge)
