@@ -158,10 +158,12 @@ def room_in_pixel(x: Array, y: Array) -> list[Array]:
     ]
 
 
-def beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float]:
+def beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float, float]:
     """Pixels from edges to the points that show what hides them, inside, and what is beyond.
 
-    As few as rounding leaves certain: where fine surfaces fold, others lie as near.
+    As few as rounding leaves certain: where fine surfaces fold, others lie as near. The last is how
+    far a vertex itself may be rounded, and still fewer: enough for faces that share one.
     """
-    outside = max(_BEYOND, _ROUNDINGS * float(jnp.finfo(dtype).eps) * max(shape))
-    return 2 * outside, outside
+    rounding = float(jnp.finfo(dtype).eps) * max(shape)
+    outside = max(_BEYOND, _ROUNDINGS * rounding)
+    return 2 * outside, outside, rounding

@@ -50,7 +50,7 @@ def uncovered(
     )
     along = ends[1] - ends[0]
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    inside, _ = beside_edge(face_image.shape, length.dtype)
+    inside, _, _ = beside_edge(face_image.shape, length.dtype)
     aside = along * (inside / jnp.where(length > 0, length, 1))
     sides = jnp.stack([-aside, aside])
     x = ends[0, 0] + pieces.range * along[0] + sides[:, None, 1]  # (2 sides, 2 ends, n)

@@ -156,8 +156,9 @@ def look(
     foreign = (around >= 0) & (around != own[0]) & (around != own[1])
 
     # Seen from just inside, and from just beyond.
-    inside, outside = beside_edge(face_image.shape, length.dtype)
-    offset = jnp.stack([-jnp.minimum(inside, thickness / 2) * out, outside * out], axis=1)
+    inside, outside, rounding = beside_edge(face_image.shape, length.dtype)
+    inset = stored(jnp.minimum(inside, thickness / 2))
+    offset = jnp.stack([-inset * out, outside * out], axis=1)
     x, y = (ends[0][:, None] + offset)[:, :, None] + (pieces.range * along[:, None])[:, None]
     x, y = stored_together((x[:, :, None], y[:, :, None]))  # (2 lines, 2 ends, 1, n)
     around_corners = corners_of(around, faces, pixels)
@@ -172,14 +173,24 @@ def look(
     first, second = _NEXT[:, : len(around)]
     across = (first & undrawn[0]) | (second & undrawn[1])
     tolerance = stored(jnp.where(across, 0, tolerance))
-    margin = stored(depth - inverse_depth(pieces.range)[:, None] * (1 + tolerance))
+    # Faces in which the surface goes on meet the edge at its ends, and reach over it with no more
+    # than rounding: so they are looked at closer to it, but for what lies beside one seen edge-on.
+    joins = jnp.any(around[:, None] == nearby, axis=1) & ~(undrawn[0] | undrawn[1])
+    closer = jnp.where(joins, jnp.maximum(inset - rounding, 0) / (inset + outside), 0)
+
+    def inside_of(values: Array) -> Array:
+        return values[0] + closer * (values[1] - values[0])
+
+    covers = [inside_of(value) for value in values]
+    limit = inverse_depth(pieces.range)[:, None] * (1 + tolerance)
+    margin = stored(jnp.stack([inside_of(depth), depth[1]]) - limit)
     # What joins a front face that is thinner than that begins where the edge is, and hides nothing.
     joined = jnp.where(use_first, first, second) & (thickness < outside)
     candidates = Candidates(
         face=around,
         patch=patch,
         foreign=foreign,
-        hides=[*(value[0] for value in values), jnp.where(joined, -1, margin[0])],
+        hides=[*covers, jnp.where(joined, -1, margin[0])],
         behind=[*(value[1] for value in values), -margin[1]],
         inverse_depth=depth[1],
     )
@@ -292,7 +303,7 @@ def look(
         visible,
         outwards(spot, nearest, farthest, surface),
         inwards(spot, inner, nearby, surface),
-        (jnp.minimum(inside, thickness / 2), outside),
+        (inset, outside),
         surface,
     )
     visible = visible & ~walks.hidden
