@@ -390,7 +390,10 @@ def white_faces(corners, faces):
 
 
 def way_past_a_centre(random, width, longest):
-    """A point nearer to a pixel's centre than that, and unit vectors along a line and across it."""
+    """Ends of a line that passes a pixel's centre nearer than that, and the unit vector across it.
+
+    Also how many times as long it is as its part before the centre.
+    """
     centre, angle = random.integers(4, 20, 2) + 0.5, random.uniform(0, 2 * np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])

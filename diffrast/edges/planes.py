@@ -161,8 +161,8 @@ def room_in_pixel(x: Array, y: Array) -> list[Array]:
 def beside_edge(shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[float, float, float]:
     """Pixels from edges to the points that show what hides them, inside, and what is beyond.
 
-    As few as rounding leaves certain: where fine surfaces fold, others lie as near. The last is how
-    far a vertex itself may be rounded, and still fewer: enough for faces that share one.
+    As few as rounding leaves certain: where fine surfaces fold, others lie as near. The last, by
+    which a vertex itself may be rounded, is enough inside for what hides a face of its own surface.
     """
     rounding = float(jnp.finfo(dtype).eps) * max(shape)
     outside = max(_BEYOND, _ROUNDINGS * rounding)
