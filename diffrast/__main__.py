@@ -1,9 +1,12 @@
 """The command line: `python -m diffrast --help`."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+import jax
 
 from diffrast import _commands
 from diffrast.files.scenes import OPERATIONS
@@ -28,7 +31,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The options of all commands."""
-    whole = argparse.ArgumentParser(prog="python -m diffrast", description="Draw and fit meshes.")
+    whole = argparse.ArgumentParser(
+        prog="python -m diffrast",
+        description="Draw and fit meshes.",
+        epilog="Compiled programs are kept for the next command in ~/.cache/diffrast, or in the"
+        " folder that JAX_COMPILATION_CACHE_DIR names; nowhere if it is empty.",
+    )
     commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(
@@ -75,6 +83,22 @@ def parser() -> argparse.ArgumentParser:
     added.add_argument("--out", type=Path, default=Path("gallery"), help="folder of the pictures")
     added.set_defaults(shading="phong")
     return whole
+
+
+def keep_programs() -> None:
+    """Compiled programs are kept from one command to the next: most of its time is compiling.
+
+    Of another machine, another version or another size of mesh or picture they are others.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:  # JAX knows of it
+        return
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = os.path.join(caches, "diffrast")
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:  # of a user who may not write there
+        return
+    jax.config.update("jax_compilation_cache_dir", folder)
 
 
 # Each command has those of these options that its result depends on.
@@ -160,4 +184,5 @@ def _angle(text: str) -> float:
 
 
 if __name__ == "__main__":
+    keep_programs()
     sys.exit(main())

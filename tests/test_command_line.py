@@ -10,7 +10,7 @@ import pytest
 
 import diffrast as dr
 from diffrast import _commands
-from diffrast.__main__ import main, parser
+from diffrast.__main__ import keep_programs, main, parser
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -50,6 +50,27 @@ def test_wireframes_and_scene_files(tmp_path):
         _, _, rest = (DATA / "house.dat").read_text(encoding="latin-1").partition("\n")
         house.write_text(head + line + rest)
         assert not _commands.is_scene_file(str(house))
+
+
+def test_programs_are_kept_where_the_user_keeps_such_things(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(jax.config, "update", lambda name, folder: kept.append((name, folder)))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    keep_programs()
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    keep_programs()
+    folders = [tmp_path / "diffrast", tmp_path / "home" / ".cache" / "diffrast"]
+    assert kept == [("jax_compilation_cache_dir", str(folder)) for folder in folders]
+    assert all(folder.is_dir() for folder in folders)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))  # no folder can be made there
+    keep_programs()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    keep_programs()
+    assert len(kept) == 2
 
 
 def test_what_belongs_to_no_face_is_not_framed():
