@@ -187,6 +187,15 @@ def crease() -> Problem:
     return Problem([ball], eye=eye, target=target, fov_y=0.6, shading="flat")
 
 
+def teapot() -> Problem:
+    """A coarse teapot of four bodies; not among `SCENES`."""
+    pot = dr.mesh.merge_near_vertices(dr.shapes.teapot(5), 1e-5)
+    pot = dr.mesh.with_normals(pot, weighting="uniform")
+    body = _object(pot, WARM, shift=(0.0, 0.0, -1.4))
+    camera = {"eye": (6.5, -6.0, 3.8), "target": (0.0, 0.0, 0.0), "up": (0.0, 0.0, 1.0)}
+    return Problem([body], **camera, fov_y=0.7, far=40.0, piercing=True, nodes=2)
+
+
 SHADE = {
     "shadow": True,
     "ambient": (0.1, 0.1, 0.1),

@@ -228,7 +228,7 @@ def with_pieces(
     across = found.end - found.begin
     area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
-    smooth = jnp.zeros_like(found.visible)
+    smooth = steep = jnp.zeros_like(found.visible)
     at_centre = [side.is_centre for side in (found.front, found.beyond)]
     if method.shader is None:
         jump = behind - front
@@ -244,7 +244,7 @@ def with_pieces(
             points[1] = points[1][0], _where(lit_around, found.half_way, points[1][1])
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
-        integral, moved = _along(found, front, bend, far, near, inner, beside)
+        integral, moved, steep = _along(found, front, bend, far, near, inner, beside)
         jump = behind - jnp.where(smooth, moved, front)
         if method.capacity:  # what is inwards of a thin face moves with its inner edge
             inner_edge, inner_motion, before_eye = motion_of_inner_edge(
@@ -267,6 +267,7 @@ def with_pieces(
     used = found.visible & (found.fold | (reduce(jnp.maximum, jnp.abs(jump)) > _NO_JUMP * size))
     held = front, behind, jnp.where(smooth, inner, front)
     rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
+    rim_length = jnp.where(steep, -rim_length, rim_length)
     leaves = area, found.front.look, found.beyond.look
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held, leaves)
     start, end = segments.vertices[:, pieces.segment]
@@ -402,30 +403,35 @@ def with_sums(
 
 def _along(
     seen: Seen, front: Array, bend: Array, far: Array, near: Array, inner: Array, beside: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """The colour of a smooth surface from its rim to where the pixel ends.
 
     Its integral over this depth, a mean along the piece, from whose ends a pixel reaches less far;
     and the colour that counts as the rim moves. As a point at a fixed depth keeps its colour, that
     is the one at the pixel's border, less what the derivative of the next pixel, which stands for
-    this one's, says of it: as far as its colour is carried along, that is its slope.
+    this one's, says of it: as far as its colour is carried along, that is its slope. And whether
+    that is too steep to go on for a pixel, as on a face much narrower than one: then nothing stands
+    for this one's derivative, and nothing is taken off.
     """
     rim = seen.rim
     first, depth = rim.first, rim.depth
     # A shadow may begin where the slope is taken.
     steepest = 2 * reduce(jnp.maximum, [jnp.abs(color) for color in (front, bend, far, inner)])
-    slope = jnp.clip((inner - beside) / BESIDE, -steepest, steepest)
+    slope = (inner - beside) / BESIDE
+    steep = reduce(jnp.logical_or, list(jnp.abs(slope) > steepest))
+    slope = jnp.clip(slope, -steepest, steepest)
     # Seen from ever flatter above, it changes with the square root of the depth.
     share = jnp.sqrt(depth / jnp.maximum(rim.inner_depth, _SHALLOW))
     expected = front + share * (
         (2 - share) * (inner - front) - 2 * (1 - share) * rim.inner_depth * slope
     )
     far = jnp.where(rim.single, far, expected)
-    far = jnp.clip(far, jnp.minimum(bend, inner), jnp.maximum(bend, inner))
-    far = jnp.where(first < depth, far, bend)
     centre = jnp.clip(seen.centre_depth, first, depth)
     passes = centre > first
     near = jnp.where(passes, near, bend)
+    known = bend, near, inner
+    far = jnp.clip(far, reduce(jnp.minimum, known), reduce(jnp.maximum, known))
+    far = jnp.where(first < depth, far, bend)
 
     def between(begin: Array, end: Array, colors: tuple[Array, Array], straight: Array) -> Array:
         """The integral over these depths; of colours that change straight or with the root."""
@@ -439,12 +445,14 @@ def _along(
     integral += between(centre, depth, (near, far), passes | rim.single)
     integral += _mean(jnp.maximum(rim.reaches - depth, 0)) * far
 
+    carried = jnp.where(steep, 0, slope)
+
     def moved(at: Array) -> Array:
         share = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))
-        return front + share * (far - front) - at * slope
+        return front + share * (far - front) - at * carried
 
     leaving, entering = (moved(at) for at in rim.border)
-    return integral, leaving + (rim.weight - 1) * (leaving - entering)
+    return integral, leaving + (rim.weight - 1) * (leaving - entering), steep
 
 
 def _mean(rows: Float[Array, "rows n"]) -> Float[Array, " n"]:

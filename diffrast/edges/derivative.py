@@ -109,7 +109,8 @@ def _push(
     """Change of the image with the homogeneous pixel coordinates and with the hard image.
 
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
-    at the next pixel's stands for it, less what `_along` takes off.
+    at the next pixel's stands for it, less what `_along` takes off, or none if that is too steep:
+    such rims have negative lengths.
     """
     centres, means = colors
 
@@ -118,8 +119,8 @@ def _push(
         integers, _, sizes, _ = rows
         _, front, _, inner, _, _ = integers.T
         length = jnp.where(used, sizes[:, 1], 0)
-        averages = averages.at[front].add(length[:, None] * centres[inner])
-        return averages, lengths.at[front].add(length), added
+        averages = averages.at[front].add(jnp.maximum(length, 0)[:, None] * centres[inner])
+        return averages, lengths.at[front].add(jnp.abs(length)), added
 
     def add(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
         averages, lengths, added = total
@@ -156,13 +157,14 @@ def _pull(
         points = points.at[start].add(along * motion[:, :3]).at[end].add(along * motion[:, 3:])
         value = value * _area(sizes[:, 0], pixel, left)
         own = own.at[beyond].add(value).at[front].add(-value)
-        return points, own, lengths.at[front].add(jnp.where(used, sizes[:, 1], 0)), inwards
+        length = jnp.where(used, jnp.abs(sizes[:, 1]), 0)
+        return points, own, lengths.at[front].add(length), inwards
 
     def average(used: Array, rows: Any, total: tuple[Array, ...]) -> tuple[Array, ...]:
         points, own, lengths, inwards = total
         integers, _, sizes, _ = rows
         _, front, _, inner, _, _ = integers.T
-        length = jnp.where(used, sizes[:, 1], 0)
+        length = jnp.where(used, jnp.maximum(sizes[:, 1], 0), 0)
         value = _mean(length[:, None] * own[front], lengths[front], jnp.zeros_like(own[front]))
         return points, own, lengths, inwards.at[inner].add(value)
 
