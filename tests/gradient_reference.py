@@ -246,8 +246,8 @@ def step_sizes(problem) -> np.ndarray:
     return np.array([tiny / moved if moved else 0.0 for moved in pixels])
 
 
-def reference_jacobian(problem, lines=None, step=None) -> np.ndarray:
-    """Return the derivatives (P, H, W, 3) of the image at rest.
+def reference_jacobian(problem, lines=None, step=None, which=slice(None)) -> np.ndarray:
+    """Return the derivatives (P, H, W, 3) of the image at rest, or those by some parameters.
 
     Central differences D over `step` pixels and twice as many give 2 D(step) - D(2 step): a pixel
     that an outline enters bends the image, and adds an error in proportion to the step.
@@ -262,7 +262,7 @@ def reference_jacobian(problem, lines=None, step=None) -> np.ndarray:
         return (ahead - behind) / (2 * np.linalg.norm(change))
 
     changes = step * np.diag(step_sizes(problem))
-    return np.stack([2 * difference(c) - difference(2 * c) for c in changes])
+    return np.stack([2 * difference(c) - difference(2 * c) for c in changes[which]])
 
 
 def adjoint_fields(size=96, count=16) -> np.ndarray:
