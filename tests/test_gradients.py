@@ -231,7 +231,8 @@ def test_derivatives_by_vertices():
 
 
 def test_pixels_with_lips_less_than_a_pixel_wide():
-    """Of a teapot, turned: of the derivative at single pixels 1.02 of its size was wrong before."""
+    """Of a teapot, turned: of the derivative at single pixels 1.02 of its size was wrong at first,
+    and .583 where a rim's own colour counted however narrow a highlight it was."""
     problem, about_z = gradient_scenes.teapot(), 9
     want = reference.reference_jacobian(problem, lines=32, which=[about_z])[0]
 
@@ -241,7 +242,7 @@ def test_pixels_with_lips_less_than_a_pixel_wide():
         return jax.jvp(image, (jnp.zeros(13),), (way,))[1]
 
     got = change(scene_of(problem), jnp.zeros(13).at[about_z].set(1))
-    assert np.linalg.norm(got - want) < 0.65 * np.linalg.norm(want)
+    assert np.linalg.norm(got - want) < 0.575 * np.linalg.norm(want)
 
 
 @pytest.mark.parametrize(

@@ -192,7 +192,7 @@ def _told(
     front = jnp.where(found.fold, -1, front)
     asked = found.fold & ~found.beyond.is_centre
     beyond = jnp.where(asked & (beyond > 0), -1, beyond)
-    inwards = jnp.where(found.rim.smooth, -1, jnp.zeros_like(front))
+    inwards = jnp.where(found.rim.smooth | found.rim.alone, -1, jnp.zeros_like(front))
     parts = [front, beyond] + [inwards] * (points - 2)
     told = jnp.concatenate([jnp.where(found.visible, part, 0) for part in parts], axis=1)
     lit_around = asked & jnp.any(around > 0, axis=0)
@@ -234,18 +234,18 @@ def with_pieces(
         jump = behind - front
         value = area * jump
     else:
-        smooth = rim.smooth
+        smooth, alone = rim.smooth, rim.alone
         points = [found.front[:2], found.beyond[:2], rim.bend, rim.far, rim.beside]
         told = None
         if view.cast is not None and found.half_way is not None:
             told, (lit_around, *parted) = _told(view, view.cast, pieces.pixel, found, len(points))
-            smooth = smooth & ~parted[0]
+            smooth, alone = (given & ~parted[0] for given in (smooth, alone))
             at_centre = [own & ~part for own, part in zip(at_centre, parted, strict=True)]
             points[1] = points[1][0], _where(lit_around, found.half_way, points[1][1])
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         integral, moved, steep = _along(found, front, bend, far, near, inner, beside)
-        jump = behind - jnp.where(smooth, moved, front)
+        jump = behind - jnp.where(smooth | alone, moved, front)
         if method.capacity:  # what is inwards of a thin face moves with its inner edge
             inner_edge, inner_motion, before_eye = motion_of_inner_edge(
                 view.positions_clip, view.size, segments, pieces, found
@@ -255,7 +255,7 @@ def with_pieces(
             jump = jump - opening
         turn = length * (integral - _mean(rim.reaches) * near)
         own = stored(_colors(view.image, centre))
-        value = jnp.where(smooth, area * (behind - near) + turn, area * jump)
+        value = jnp.where(smooth, area * (behind - near) + turn, area * (behind - front))
         if view.meaned is not None:
             meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
             first, second = (meaned & own for own in at_centre)
@@ -412,6 +412,10 @@ def _along(
     this one's, says of it: as far as its colour is carried along, that is its slope. And whether
     that is too steep to go on for a pixel, as on a face much narrower than one: then nothing stands
     for this one's derivative, and nothing is taken off.
+
+    Where the pixel's own centre is what is known of the surface, it is the colour that is carried
+    along from there to the rim. What the rim shows beside that, as the highlight of a lip, moves
+    along with it inside of the pixel, and adds nothing.
     """
     rim = seen.rim
     first, depth = rim.first, rim.depth
@@ -452,7 +456,9 @@ def _along(
         return front + share * (far - front) - at * carried
 
     leaving, entering = (moved(at) for at in rim.border)
-    return integral, leaving + (rim.weight - 1) * (leaving - entering), steep
+    moving = leaving + (rim.weight - 1) * (leaving - entering)
+    moving = jnp.where(rim.alone, near - rim.inner_depth * carried, moving)
+    return integral, moving, steep
 
 
 def _mean(rows: Float[Array, "rows n"]) -> Float[Array, " n"]:

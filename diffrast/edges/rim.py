@@ -22,7 +22,8 @@ class Rim(NamedTuple):
     """The surface in front of pieces, from the piece inwards as far as the pixel reaches."""
 
     smooth: Bool[Array, " n"]  # whether this pixel and the next show the same smooth surface
-    inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards
+    alone: Bool[Array, " n"]  # or only this pixel does, of the two,
+    inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards, or this one if alone
     reaches: Float[Array, "4 n"]  # how far the pixel reaches, from the middles of four parts
     depth: Float[Array, " n"]  # and from that of the whole,
     first: Float[Array, " n"]  # and how far the face at the edge does, if that is less
@@ -105,6 +106,7 @@ def look_inwards(
     border, weight = _border(own_depth, inward)
     return Rim(
         smooth=(front >= 0) & connected & goes_on,
+        alone=inner == 4,
         inner=inner,
         reaches=jnp.stack([reach(middle + way * across, inward) for way in _EIGHTHS]),
         depth=depth,

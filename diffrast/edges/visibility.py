@@ -326,12 +326,14 @@ def look(
     beyond_look = _where_shown(beyond, beyond_look, patch, topology.patches)
     beyond_look = stored(jnp.where(gap, bare_look, beyond_look))
 
+    # Where the next pixel inwards shows something else, the pixel's own centre takes its place.
+    alone = walks.connected[0] & ~walks.connected[1] & (front_look == 4)
     rim = look_inwards(
         front,
         apex,
         thickness,
         pictured,
-        (rim_depth, inner),
+        (rim_depth, stored(jnp.where(alone, 4, inner))),
         walks.connected[0] & walks.connected[1],
         middle,
         length,
