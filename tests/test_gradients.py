@@ -232,7 +232,8 @@ def test_derivatives_by_vertices():
 
 def test_pixels_with_lips_less_than_a_pixel_wide():
     """Of a teapot, turned: of the derivative at single pixels 1.02 of its size was wrong at first,
-    and .583 where a rim's own colour counted however narrow a highlight it was."""
+    and .583 where a rim's own colour counted however narrow a highlight it was.
+    """
     problem, about_z = gradient_scenes.teapot(), 9
     want = reference.reference_jacobian(problem, lines=32, which=[about_z])[0]
 

@@ -22,8 +22,7 @@ class Rim(NamedTuple):
     """The surface in front of pieces, from the piece inwards as far as the pixel reaches."""
 
     smooth: Bool[Array, " n"]  # whether this pixel and the next show the same smooth surface
-    alone: Bool[Array, " n"]  # or only this pixel does, of the two,
-    inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards, or this one if alone
+    inner: Int[Array, " n"]  # 0 to 8: the next pixel of the 3×3 inwards, or this one: see `alone`
     reaches: Float[Array, "4 n"]  # how far the pixel reaches, from the middles of four parts
     depth: Float[Array, " n"]  # and from that of the whole,
     first: Float[Array, " n"]  # and how far the face at the edge does, if that is less
@@ -36,6 +35,11 @@ class Rim(NamedTuple):
     inner_depth: Float[Array, " n"]  # of that centre
     border: Float[Array, "2 n"]  # depths of the pixel's border, see `_border`,
     weight: Float[Array, " n"]  # and the first one's weight
+
+    @property
+    def alone(self) -> Bool[Array, " n"]:
+        """Whether this pixel shows the surface in front, and the next one does not."""
+        return self.inner == 4
 
 
 def next_inwards(
@@ -106,7 +110,6 @@ def look_inwards(
     border, weight = _border(own_depth, inward)
     return Rim(
         smooth=(front >= 0) & connected & goes_on,
-        alone=inner == 4,
         inner=inner,
         reaches=jnp.stack([reach(middle + way * across, inward) for way in _EIGHTHS]),
         depth=depth,
