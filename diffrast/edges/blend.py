@@ -228,7 +228,7 @@ def with_pieces(
     across = found.end - found.begin
     area, length = outward * area_beyond(found.begin, found.end), jnp.hypot(*across)
     area, length = stored_together((area, length))
-    smooth = steep = jnp.zeros_like(found.visible)
+    smooth = replaced = steep = jnp.zeros_like(found.visible)
     at_centre = [side.is_centre for side in (found.front, found.beyond)]
     if method.shader is None:
         jump = behind - front
@@ -245,19 +245,23 @@ def with_pieces(
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
         integral, moved, steep = _along(found, front, bend, far, near, inner, beside)
-        jump = behind - jnp.where(smooth | alone, moved, front)
+        follows, carried = smooth & ~alone, alone
+        if view.meaned is not None:
+            meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
+            carried = carried & ~(smooth & meaned)  # what is round a lip is part of that mean
+        jump = behind - jnp.where(follows | carried, moved, front)
         if method.capacity:  # what is inwards of a thin face moves with its inner edge
             inner_edge, inner_motion, before_eye = motion_of_inner_edge(
                 view.positions_clip, view.size, segments, pieces, found
             )
-            thin = smooth & rim.thin & before_eye
+            thin = follows & rim.thin & before_eye
             opening = stored(jnp.where(thin, (front + bend) / 2 - moved, 0))
             jump = jump - opening
+        replaced = (follows | (alone & steep)) & (found.front.look == 4)
         turn = length * (integral - _mean(rim.reaches) * near)
         own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * (behind - front))
         if view.meaned is not None:
-            meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
             first, second = (meaned & own for own in at_centre)
             value = jnp.where(first, area * (behind - own), value)
             value = jnp.where(second, value + area * (own - behind), value)
@@ -266,7 +270,7 @@ def with_pieces(
     size = reduce(jnp.maximum, jnp.abs(behind) + jnp.abs(front))
     used = found.visible & (found.fold | (reduce(jnp.maximum, jnp.abs(jump)) > _NO_JUMP * size))
     held = front, behind, jnp.where(smooth, inner, front)
-    rim_length = jnp.where(used & smooth & (found.front.look == 4), length, 0)
+    rim_length = jnp.where(used & replaced, length, 0)
     rim_length = jnp.where(steep, -rim_length, rim_length)
     leaves = area, found.front.look, found.beyond.look
     sums, pixel = _with_values(total.sums, view, pieces.pixel, used, value, held, leaves)

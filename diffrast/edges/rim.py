@@ -38,7 +38,7 @@ class Rim(NamedTuple):
 
     @property
     def alone(self) -> Bool[Array, " n"]:
-        """Whether this pixel shows the surface in front, and the next one does not."""
+        """Whether this pixel shows the surface in front, and the next one not this side of it."""
         return self.inner == 4
 
 

@@ -326,8 +326,9 @@ def look(
     beyond_look = _where_shown(beyond, beyond_look, patch, topology.patches)
     beyond_look = stored(jnp.where(gap, bare_look, beyond_look))
 
-    # Where the next pixel inwards shows something else, the pixel's own centre takes its place.
-    alone = walks.connected[0] & ~walks.connected[1] & (front_look == 4)
+    # Where the next pixel inwards shows something else, or what lies round a lip, the pixel's own
+    # centre takes its place.
+    alone = walks.goes_on[0] & ~walks.goes_on[1] & (front_look == 4)
     rim = look_inwards(
         front,
         apex,

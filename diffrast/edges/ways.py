@@ -58,6 +58,7 @@ class Inwards(NamedTuple):
     starts: Int[Array, "2 n"]  # faces at the pixel in front and at the next one inwards; or -1
     plain: Bool[Array, "2 n"]  # whether it is plain that the surface in front goes on to them
     alike: Bool[Array, "2 n"]  # whether it may
+    turned: Bool[Array, "2 n"]  # whether they are seen from the other side than the one in front
 
 
 class Walked(NamedTuple):
@@ -66,7 +67,8 @@ class Walked(NamedTuple):
     hidden: Bool[Array, " n"]  # the piece is
     behind: Int[Array, " n"]  # the face behind it, or -1
     ends: Bool[Array, " n"]  # nothing is, and what is seen beyond ends before
-    connected: Bool[Array, "2 n"]  # whether the pixels of `Inwards` show the surface in front
+    connected: Bool[Array, "2 n"]  # whether the pixels of `Inwards` show the surface in front,
+    goes_on: Bool[Array, "2 n"]  # and from the same side, so that no lip lies between
     inside: Float[Array, "2 n"]  # the point just inside, on the screen,
     beyond: Float[Array, "2 n"]  # and just beyond
 
@@ -147,7 +149,9 @@ def inwards(
     planes = jnp.stack([picked(spot.depths, look) for look in looks]) - spot.near
     plain = (ours == spot.front) | jnp.any(nearby[:, None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
-    return Inwards(jnp.where(alike & ~plain, ours, -1), plain, alike & ~hidden)
+    sides = jnp.sign(surface.volume[jnp.maximum(both, 0)])
+    turned = sides[0] != sides[1]
+    return Inwards(jnp.where(alike & ~plain, ours, -1), plain, alike & ~hidden, turned)
 
 
 def walked(
@@ -188,6 +192,7 @@ def walked(
         behind,
         ends,
         connected,
+        connected & ~inward.turned,
         inside=jnp.stack([x[4], y[4]]),
         beyond=jnp.stack([x[0], y[0]]),
     )
