@@ -20,7 +20,7 @@ from diffrast.edges.areas import area_beyond, motion_of_edge, motion_of_inner_ed
 from diffrast.edges.pieces import Pieces, Segments
 from diffrast.edges.piercing import Line
 from diffrast.edges.records import Records, Start, no_records, with_lines, with_rows
-from diffrast.edges.rim import BESIDE
+from diffrast.edges.rim import colors_along, mean_of_rows
 from diffrast.edges.shadow_lines import Shadow
 from diffrast.edges.shadow_pairs import Cast, light_told
 from diffrast.edges.unseen import Survey
@@ -28,7 +28,6 @@ from diffrast.edges.visibility import BACKGROUND, SNAPPED, Seen
 
 LEFT_STEPS = 256  # to a pixel's area: `Sums.left` is kept in two bytes a pixel
 _NO_JUMP = 1e-5  # of the colours, which are as rounding leaves them
-_SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
 
 Shader = Callable[[Any, Array, list[Array], Array | None], list[Array]]
 Glow = Callable[[Any, Array, Array, list[Array]], list[Array]]
@@ -244,7 +243,9 @@ def with_pieces(
             points[1] = points[1][0], _where(lit_around, found.half_way, points[1][1])
         front, beyond, bend, far, beside = _shade(view, method, told, *points)
         behind = jnp.where(found.beyond.face >= 0, beyond, behind)
-        integral, moved, steep = _along(found, front, bend, far, near, inner, beside)
+        integral, moved, steep = colors_along(
+            rim, found.centre_depth, front, bend, far, near, inner, beside
+        )
         follows, carried = smooth & ~alone, alone
         if view.meaned is not None:
             meaned = stored(view.meaned.reshape(-1)[number_of_pixel(view, pieces.pixel)])
@@ -258,7 +259,7 @@ def with_pieces(
             opening = stored(jnp.where(thin, (front + bend) / 2 - moved, 0))
             jump = jump - opening
         replaced = (follows | (alone & steep)) & (found.front.look == 4)
-        turn = length * (integral - _mean(rim.reaches) * near)
+        turn = length * (integral - mean_of_rows(rim.reaches) * near)
         own = stored(_colors(view.image, centre))
         value = jnp.where(smooth, area * (behind - near) + turn, area * (behind - front))
         if view.meaned is not None:
@@ -403,71 +404,6 @@ def with_sums(
         return within(added)
     witness = sums.added[0, 0]
     return (1 + zero_after(witness)) * stepped(within, added, witness)
-
-
-def _along(
-    seen: Seen, front: Array, bend: Array, far: Array, near: Array, inner: Array, beside: Array
-) -> tuple[Array, Array, Array]:
-    """The colour of a smooth surface from its rim to where the pixel ends.
-
-    Its integral over this depth, a mean along the piece, from whose ends a pixel reaches less far;
-    and the colour that counts as the rim moves. As a point at a fixed depth keeps its colour, that
-    is the one at the pixel's border, less what the derivative of the next pixel, which stands for
-    this one's, says of it: as far as its colour is carried along, that is its slope. And whether
-    that is too steep to go on for a pixel, as on a face much narrower than one: then nothing stands
-    for this one's derivative, and nothing is taken off.
-
-    Where the pixel's own centre is what is known of the surface, it is the colour that is carried
-    along from there to the rim. What the rim shows beside that, as the highlight of a lip, moves
-    along with it inside of the pixel, and adds nothing.
-    """
-    rim = seen.rim
-    first, depth = rim.first, rim.depth
-    # A shadow may begin where the slope is taken.
-    steepest = 2 * reduce(jnp.maximum, [jnp.abs(color) for color in (front, bend, far, inner)])
-    slope = (inner - beside) / BESIDE
-    steep = reduce(jnp.logical_or, list(jnp.abs(slope) > steepest))
-    slope = jnp.clip(slope, -steepest, steepest)
-    # Seen from ever flatter above, it changes with the square root of the depth.
-    share = jnp.sqrt(depth / jnp.maximum(rim.inner_depth, _SHALLOW))
-    expected = front + share * (
-        (2 - share) * (inner - front) - 2 * (1 - share) * rim.inner_depth * slope
-    )
-    far = jnp.where(rim.single, far, expected)
-    centre = jnp.clip(seen.centre_depth, first, depth)
-    passes = centre > first
-    near = jnp.where(passes, near, bend)
-    known = bend, near, inner
-    far = jnp.clip(far, reduce(jnp.minimum, known), reduce(jnp.maximum, known))
-    far = jnp.where(first < depth, far, bend)
-
-    def between(begin: Array, end: Array, colors: tuple[Array, Array], straight: Array) -> Array:
-        """The integral over these depths; of colours that change straight or with the root."""
-        at = jnp.clip(rim.reaches, begin, end) - begin
-        share = at / jnp.maximum(end - begin, _SHALLOW)
-        share = at * jnp.where(straight, share / 2, 2 / 3 * jnp.sqrt(share))
-        return _mean(at) * colors[0] + _mean(share) * (colors[1] - colors[0])
-
-    integral = between(jnp.zeros_like(first), first, (front, bend), jnp.ones_like(passes))
-    integral += between(first, centre, (bend, near), rim.single)
-    integral += between(centre, depth, (near, far), passes | rim.single)
-    integral += _mean(jnp.maximum(rim.reaches - depth, 0)) * far
-
-    carried = jnp.where(steep, 0, slope)
-
-    def moved(at: Array) -> Array:
-        share = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))
-        return front + share * (far - front) - at * carried
-
-    leaving, entering = (moved(at) for at in rim.border)
-    moving = leaving + (rim.weight - 1) * (leaving - entering)
-    moving = jnp.where(rim.alone, near - rim.inner_depth * carried, moving)
-    return integral, moving, steep
-
-
-def _mean(rows: Float[Array, "rows n"]) -> Float[Array, " n"]:
-    """The mean of rows, without the pass that XLA makes of every reduction."""
-    return reduce(jnp.add, list(rows)) / rows.shape[0]
 
 
 def cropped(colors: Array, shape: tuple[int, ...]) -> Array:

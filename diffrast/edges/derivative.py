@@ -109,8 +109,8 @@ def _push(
     """Change of the image with the homogeneous pixel coordinates and with the hard image.
 
     What the rim of a smooth surface shows changes without bounds at a pixel's centre; the change
-    at the next pixel's stands for it, less what `_along` takes off, or none if that is too steep:
-    such rims have negative lengths.
+    at the next pixel's stands for it, less what `colors_along` takes off, or none if that is too
+    steep: such rims have negative lengths.
     """
     centres, means = colors
 

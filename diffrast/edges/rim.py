@@ -1,5 +1,6 @@
 """The surface just inside of an edge, as far as the edge's pixel reaches."""
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ _THIN = 0.15  # pixels
 _LONG = 4.0  # pixels: where edges are shorter, the next face takes the place of one that opens
 _EIGHTHS = (-3 / 8, -1 / 8, 1 / 8, 3 / 8)  # of a piece, from its middle
 SHORT = 1e-3  # pixels: no piece is left that is shorter
+_SHALLOW = 1e-3  # pixels: keeps ratios of depths finite
 
 
 class Rim(NamedTuple):
@@ -146,3 +148,84 @@ def _border(centre: Float[Array, " n"], inward: Float[Array, "2 n"]) -> tuple[Ar
     shrinks, grows = share
     weight = shrinks / jnp.maximum(shrinks - grows, SHORT)
     return (inside[:, 0] + inside[:, 1]) / 2, weight
+
+
+def colors_along(
+    rim: Rim,
+    centre: Float[Array, " n"],
+    front: Float[Array, "channels n"],
+    bend: Float[Array, "channels n"],
+    far: Float[Array, "channels n"],
+    near: Float[Array, "channels n"],
+    inner: Float[Array, "channels n"],
+    beside: Float[Array, "channels n"],
+) -> tuple[Float[Array, "channels n"], Float[Array, "channels n"], Bool[Array, " n"]]:
+    """The colour of a smooth surface from its rim to where the pixel ends.
+
+    Its integral over this depth, a mean along the piece, from whose ends a pixel reaches less far;
+    and the colour that counts as the rim moves. As a point at a fixed depth keeps its colour, that
+    is the one at the pixel's border, less what the derivative of the next pixel, which stands for
+    this one's, says of it: as far as its colour is carried along, that is its slope. And whether
+    that is too steep to go on for a pixel, as on a face much narrower than one: then nothing stands
+    for this one's derivative, and nothing is taken off.
+
+    Where the pixel's own centre is what is known of the surface, it is the colour that is carried
+    along from there to the rim. What the rim shows beside that, as the highlight of a lip, moves
+    along with it inside of the pixel, and adds nothing.
+
+    Args:
+        rim: what lies inwards of pieces.
+        centre: depth of the pixel's centre.
+        front: colour at the edge.
+        bend: where the face there ends,
+        far: where the pixel does,
+        near: at the centre of the pixel that shows the surface first,
+        inner: at that of the next one inwards,
+        beside: at `rim.beside`.
+    """
+    first, depth = rim.first, rim.depth
+    # A shadow may begin where the slope is taken.
+    steepest = 2 * reduce(jnp.maximum, [jnp.abs(color) for color in (front, bend, far, inner)])
+    slope = (inner - beside) / BESIDE
+    steep = reduce(jnp.logical_or, list(jnp.abs(slope) > steepest))
+    slope = jnp.clip(slope, -steepest, steepest)
+    # Seen from ever flatter above, it changes with the square root of the depth.
+    share = jnp.sqrt(depth / jnp.maximum(rim.inner_depth, _SHALLOW))
+    expected = front + share * (
+        (2 - share) * (inner - front) - 2 * (1 - share) * rim.inner_depth * slope
+    )
+    far = jnp.where(rim.single, far, expected)
+    centre = jnp.clip(centre, first, depth)
+    passes = centre > first
+    near = jnp.where(passes, near, bend)
+    known = bend, near, inner
+    far = jnp.clip(far, reduce(jnp.minimum, known), reduce(jnp.maximum, known))
+    far = jnp.where(first < depth, far, bend)
+
+    def between(begin: Array, end: Array, colors: tuple[Array, Array], straight: Array) -> Array:
+        """The integral over these depths; of colours that change straight or with the root."""
+        at = jnp.clip(rim.reaches, begin, end) - begin
+        share = at / jnp.maximum(end - begin, _SHALLOW)
+        share = at * jnp.where(straight, share / 2, 2 / 3 * jnp.sqrt(share))
+        return mean_of_rows(at) * colors[0] + mean_of_rows(share) * (colors[1] - colors[0])
+
+    integral = between(jnp.zeros_like(first), first, (front, bend), jnp.ones_like(passes))
+    integral += between(first, centre, (bend, near), rim.single)
+    integral += between(centre, depth, (near, far), passes | rim.single)
+    integral += mean_of_rows(jnp.maximum(rim.reaches - depth, 0)) * far
+
+    carried = jnp.where(steep, 0, slope)
+
+    def moved(at: Array) -> Array:
+        share = jnp.sqrt(at / jnp.maximum(depth, _SHALLOW))
+        return front + share * (far - front) - at * carried
+
+    leaving, entering = (moved(at) for at in rim.border)
+    moving = leaving + (rim.weight - 1) * (leaving - entering)
+    moving = jnp.where(rim.alone, near - rim.inner_depth * carried, moving)
+    return integral, moving, steep
+
+
+def mean_of_rows(rows: Float[Array, "rows n"]) -> Float[Array, " n"]:
+    """The mean of rows, without the pass that XLA makes of every reduction."""
+    return reduce(jnp.add, list(rows)) / rows.shape[0]
