@@ -171,7 +171,8 @@ def colors_along(
 
     Where the pixel's own centre is what is known of the surface, it is the colour that is carried
     along from there to the rim. What the rim shows beside that, as the highlight of a lip, moves
-    along with it inside of the pixel, and adds nothing.
+    along with it inside of the pixel, and adds nothing; nor does that centre's own change where
+    its slope is too steep.
 
     Args:
         rim: what lies inwards of pieces.

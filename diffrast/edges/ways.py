@@ -8,7 +8,14 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from diffrast._stored import stored, stored_together
-from diffrast.edges.neighborhood import Surface, least_row, picked, steps_to, walk
+from diffrast.edges.neighborhood import (
+    Surface,
+    least_row,
+    picked,
+    steps_to,
+    turned_alike,
+    walk,
+)
 from diffrast.edges.planes import (
     FINE_TOLERANCE,
     Columns,
@@ -58,7 +65,7 @@ class Inwards(NamedTuple):
     starts: Int[Array, "2 n"]  # faces at the pixel in front and at the next one inwards; or -1
     plain: Bool[Array, "2 n"]  # whether it is plain that the surface in front goes on to them
     alike: Bool[Array, "2 n"]  # whether it may
-    turned: Bool[Array, "2 n"]  # whether they are seen from the other side than the one in front
+    same_side: Bool[Array, "2 n"]  # whether they turn the same side to the eye as the one in front
 
 
 class Walked(NamedTuple):
@@ -149,9 +156,9 @@ def inwards(
     planes = jnp.stack([picked(spot.depths, look) for look in looks]) - spot.near
     plain = (ours == spot.front) | jnp.any(nearby[:, None] == ours, axis=0)
     plain = plain | ((ahead > 0) & (abs(planes) < _PLAIN * ahead))
-    sides = jnp.sign(surface.volume[jnp.maximum(both, 0)])
-    turned = sides[0] != sides[1]
-    return Inwards(jnp.where(alike & ~plain, ours, -1), plain, alike & ~hidden, turned)
+    facing = jnp.sign(surface.volume[jnp.maximum(spot.front, 0)])
+    same_side = turned_alike(ours, facing, surface.volume)
+    return Inwards(jnp.where(alike & ~plain, ours, -1), plain, alike & ~hidden, same_side)
 
 
 def walked(
@@ -192,7 +199,7 @@ def walked(
         behind,
         ends,
         connected,
-        connected & ~inward.turned,
+        connected & inward.same_side,
         inside=jnp.stack([x[4], y[4]]),
         beyond=jnp.stack([x[0], y[0]]),
     )
