@@ -168,8 +168,9 @@ def _told(
     """What pixels tell of the light in front and beyond, the first of each piece's points.
 
     Beside creases: what is at a fold may be in its shadow, which no pixel may show; so of folds
-    only that it is dark beyond, and that it is lit where the pixel's centre shows what is there:
-    the colour that the area loses is the centre's, however narrow a strip lies in the dark. Where
+    only that it is dark beyond, if no outline parts that in the pixel, and that it is lit where the
+    pixel's centre shows what is there: the colour that the area loses is the centre's, however
+    narrow a strip lies in the dark. Where
     an outline may cross a crease, both sides have the light of the pixel's centre, and so has what
     lies beyond a fold through the centre, where the outline may be the same line. Of points whose
     colours are not used no light is asked.
@@ -178,7 +179,7 @@ def _told(
     in front and beyond of which some do, and others do not: it is not the shading that changes
     there.
     """
-    (front, in_front), (beyond, around) = (
+    (front, in_front, _), (beyond, around, parted_beyond) = (
         light_told(cast, view.face_image, pixel, side.face) for side in (found.front, found.beyond)
     )
     column, row = pixel + 1
@@ -190,7 +191,7 @@ def _told(
     beyond = jnp.where(on_edge & (beyond < 0), here, beyond)
     front = jnp.where(found.fold, -1, front)
     asked = found.fold & ~found.beyond.is_centre
-    beyond = jnp.where(asked & (beyond > 0), -1, beyond)
+    beyond = jnp.where(asked & ((beyond > 0) | parted_beyond), -1, beyond)
     inwards = jnp.where(found.rim.smooth | found.rim.alone, -1, jnp.zeros_like(front))
     parts = [front, beyond] + [inwards] * (points - 2)
     told = jnp.concatenate([jnp.where(found.visible, part, 0) for part in parts], axis=1)
@@ -326,7 +327,7 @@ def _lit_by_pixels(
     """
     told, lit_around = [], []
     for look, face in zip(line.look, line.face, strict=True):
-        _, around = light_told(cast, view.face_image, line.pixel, face)
+        _, around, _ = light_told(cast, view.face_image, line.pixel, face)
         asked = (look != 4) & (around > 0)
         told.append(jnp.where(line.used, jnp.maximum(jnp.where(asked, -1, around), -1), 0))
         lit_around.append(stored(jnp.any(asked, axis=0)))
@@ -341,11 +342,13 @@ def with_shadow(total: Blended, view: View, method: Method, line: Shadow) -> Ble
     barycentrics = _on_faces(view, line.face, line.barycentrics)
     colors = method.glow(view.scene, line.light, line.face, barycentrics)
     glow = jnp.stack(stored_together(colors))
-    jump = stored(jnp.where(line.lit_on_right, 1, -1) * glow)
+    to_lit = jnp.where(line.lit_on_right, 1, -1)
+    jump = stored(to_lit * glow)
     own = stored(_colors(view.image, _place(view, line.pixel, 4)))
-    to_other = jnp.where(line.centre_is_lit, -1, 1) * glow
     value = area * jump
-    held = own, own + to_other
+    # How dark the ground is that the centre does not show is not known.
+    darkens = jnp.where(line.on_centre, line.centre_is_lit, area * to_lit < 0)
+    held = own, jnp.where(darkens, jnp.where(line.on_centre, own - glow, 0), own + glow)
     leaves = area, line.look[1], line.look[0]
     sums, number = _with_values(total.sums, view, line.pixel, line.used, value, held, leaves)
     places = [_place(view, line.pixel, look) for look in line.look]

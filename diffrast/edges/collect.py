@@ -112,7 +112,7 @@ def _edges(
                 view.face_image,
                 near_bare,
                 unseen,
-                shadowed=view.cast is not None,
+                view.cast,
             )
             total = with_pieces(state[2], view, method, segments, pieces, found)
             return n, instead_of_first(waiting, left), total

@@ -65,6 +65,14 @@ def corners_of(face: Int[Array, "*n"], faces: Int[Array, "F 3"], pixels: Table) 
     return stored(pixels[:, stored(faces.T[:, jnp.maximum(face, 0)])])
 
 
+def from_centre(vertices: Array, pixel: Int[Array, "2 n"]) -> Array:
+    """x, y and w of vertices on the screen, from pixels' centres."""
+    x, y, w = vertices
+    centre = pixel.astype(w.dtype) + 0.5
+    moved = jnp.broadcast_arrays(x - centre[0] * w, y - centre[1] * w, w)
+    return stored(jnp.stack(moved))
+
+
 def edge_values(
     corners: Array, x: Array, y: Array, near: tuple[Array, Array] | None = None
 ) -> tuple[Columns, Array]:

@@ -20,15 +20,18 @@ from jaxtyping import Bool, Float, Int
 
 from diffrast._selection import divided, selected
 from diffrast._stored import stored, stored_together
+from diffrast.edges.follow import follow
 from diffrast.edges.neighborhood import Surface, first_row, picked, pixels_round, steps_to, walk
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import (
+    TOLERANCE,
     Columns,
     barycentrics,
     corners_of,
     dot_rows,
     edge_functions,
     edge_values,
+    from_centre,
     largest,
     room_in_pixel,
 )
@@ -96,6 +99,7 @@ class Outlines(NamedTuple):
     looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
     hider: Int[Array, "edges n"]  # what hides where the shadow begins or ends; -1: nothing
     centre_is_lit: Bool[Array, " n"]  # in the image
+    on_centre: Bool[Array, " n"]  # whether that shows what the shadows fall on
     alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light
     shift: Float[Array, "2 n"]  # of all lines of a pixel: see `past_centre`
     range: Float[Array, "2 edges faces n"]  # begin and end, from the point next to the centre
@@ -114,6 +118,7 @@ class Shadow(NamedTuple):
     look: Int[Array, "2 n"]  # 0 to 8: pixels on the right and on the left
     lit_on_right: Bool[Array, " n"]
     centre_is_lit: Bool[Array, " n"]  # in the image
+    on_centre: Bool[Array, " n"]  # whether that shows this surface
     begin: Float[Array, "2 n"]  # ends, from the pixel's centre
     end: Float[Array, "2 n"]
     vertices: Int[Array, "4 2 n"]  # start and end of the edge; the face's corners; the light; and
@@ -134,7 +139,7 @@ def cross_shadows(
     faces, pixels, topology, _ = surface
 
     def place(vertex: Array) -> Array:
-        return _from_centre(pixels[:, vertex], pixel)
+        return from_centre(pixels[:, vertex], pixel)
 
     # The faces round the pixel and beside its own, and those of its surface that are turned to the
     # light.
@@ -142,36 +147,45 @@ def cross_shadows(
     shown = stored(pixels_round(face_image, *pixel))
     seen = jnp.maximum(shown, 0)
     own, patch = shown[4], stored(cast.patches[seen])
-    same = (shown >= 0) & (patch == patch[4])
-    counts = stored(same & cast.turned[light, seen])
     lit = stored(cast.lit[light, row, column])
 
     codes = stored(cast.between[light, DIRECTION[:, None], row[FIRST], column[FIRST]])
     between, on_one = decoded(codes)
-    is_ground = jnp.where(on_one == ON_SECOND, same[SECOND], same[FIRST]) & same[4]
-    known, between = stored((exists & (between >= 0) & is_ground, between))
+    exists = exists & (between >= 0)
+    on_patch = jnp.where(on_one == ON_SECOND, patch[SECOND], patch[FIRST])
+    on_own = exists & (on_patch == patch[4]) & (own >= 0)
+    # Where no outline passes on what the centre shows, one may on what is seen beside that.
+    on_other = exists & (on_one == ON_BOTH) & ~jnp.any(on_own, axis=0)
+    other = first_row(on_other)
+    home = stored(jnp.where(other < len(FIRST), jnp.asarray(FIRST)[other], 4))
+    ground_patch = picked(patch, home)
+    same = (shown >= 0) & (patch == ground_patch)
+    counts = stored(same & cast.turned[light, seen])
+    known, between = stored(((on_own | on_other) & (on_patch == ground_patch), between))
     pair, found = _unlike(between, known, _EDGES)
     looks = jnp.stack([jnp.asarray(FIRST)[pair], jnp.asarray(SECOND)[pair]])
     edge, on_one = stored(decoded(jnp.stack([picked(codes, k) for k in pair])))
     is_second, is_hidden = on_one == ON_SECOND, on_one != ON_BOTH
-    home, away = jnp.where(is_second, looks[::-1], looks)
-    first_is_lit = jnp.stack([picked(lit, k) for k in home]) != is_second
-    hider = jnp.where(is_hidden, jnp.stack([picked(shown, k) for k in away]), -1)
-    shows_ground = jnp.where(is_hidden, home, looks)
+    near, far = jnp.where(is_second, looks[::-1], looks)
+    first_is_lit = jnp.stack([picked(lit, k) for k in near]) != is_second
+    hider = jnp.where(is_hidden, jnp.stack([picked(shown, k) for k in far]), -1)
+    hider = jnp.where(same[4], hider, own)
+    shows_ground = jnp.where(is_hidden, near, looks)
     looks = lit_look, dark_look = jnp.where(first_is_lit, looks, looks[::-1])
 
     def beside(face: Array) -> tuple[Array, Array]:
         """The faces beside each, and whether the surface goes on there, turned to the light."""
         joined = stored(jnp.moveaxis(topology.neighbors[face], -1, 0))
         there = jnp.maximum(joined, 0)
-        goes_on = (joined >= 0) & cast.turned[light, there] & (cast.patches[there] == patch[4])
+        goes_on = (joined >= 0) & cast.turned[light, there] & (cast.patches[there] == ground_patch)
         return joined, stored(goes_on)
 
-    joined, joins = beside(seen[4])
-    near = jnp.concatenate([shown[4:5], joined, shown[NEAREST[1:]]])
-    falls = jnp.concatenate([counts[4:5], joins & counts[4], counts[NEAREST[1:]]])
-    which, received = _unlike(near, falls, _FACES)
-    ground_face = jnp.stack([picked(near, k) for k in which])
+    joined, joins = beside(picked(seen, home))
+    around = jnp.concatenate([picked(shown, home)[None], joined, shown[NEAREST[1:]]])
+    turned = picked(counts, home)[None]
+    falls = jnp.concatenate([turned, joins & turned, counts[NEAREST[1:]]])
+    which, received = _unlike(around, falls, _FACES)
+    ground_face = jnp.stack([picked(around, k) for k in which])
     is_own = received & (ground_face == own)
 
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
@@ -275,6 +289,7 @@ def cross_shadows(
         looks=jnp.where(first_is_lit, shows_ground, shows_ground[::-1]),
         hider=hider,
         centre_is_lit=lit[4],
+        on_centre=same[4],
         alone=alone,
         shift=past_centre(outwards, beyond, passed, lit[4]),
         range=range_,
@@ -342,6 +357,7 @@ def shadow_of(
     at, hides = _before(pixel, edge, covering, face, cast, surface, face_image)
     first, last = (stored(jnp.stack([*point, _nearness(ground, *point)])) for point in whole)
     bare = uncovered(first, last, at, hides)
+    bare = common(bare, _out_of(covering[::2], (first, last), pixel, surface))
     low, high = stored_together([low + part * (high - low) for part in bare])
     exists = exists & (low < high)
     x, y = middle = foot + (low + high) / 2 * along
@@ -387,11 +403,35 @@ def shadow_of(
         look=jnp.where(lit_on_right, looks, looks[::-1]),
         lit_on_right=lit_on_right,
         centre_is_lit=centre_is_lit,
+        on_centre=outlines.on_centre[place],
         begin=middle - (high - low) / 2 * along,
         end=middle + (high - low) / 2 * along,
         vertices=jnp.stack(vertices).reshape(4, 2, -1),
         motion=jnp.where(exists, motion, 0),
     )
+
+
+def _out_of(
+    covering: Int[Array, "2 n"],
+    ends: tuple[Float[Array, "3 n"], Float[Array, "3 n"]],
+    pixel: Int[Array, "2 n"],
+    surface: Surface,
+) -> tuple[Array, Array]:
+    """What parts of lines, 0 to 1, surfaces leave whose faces cover their begins and ends."""
+
+    def corners(face: Array) -> Array:
+        at = jnp.concatenate([pixel, pixel], axis=1)
+        return from_centre(corners_of(face, surface.faces, surface.pixels), at)
+
+    (x, y, nearness), (to_x, to_y, _) = (jnp.concatenate(way, axis=1) for way in (ends, ends[::-1]))
+    face, zero = covering.reshape(-1), jnp.zeros_like(x)
+    _, depth = edge_values(corners(face), x, y, near=(zero, zero))
+    hides = (face >= 0) & (depth > nearness * (1 + TOLERANCE))
+    start, way = stored((jnp.where(hides, face, -1), [[x, y], [to_x, to_y]]))
+    edge, part = follow(start, surface.topology.neighbors, corners, way)
+    part = jnp.where(hides, jnp.where(edge >= 0, part, 1), 0)
+    low, high = part.reshape(2, -1)
+    return low, 1 - high
 
 
 def _before(
@@ -411,18 +451,11 @@ def _before(
     faces, pixels, topology, volume = surface
     caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
     at_edge = jnp.stack([caster, topology.neighbors[caster, third]])
-    around = stored(pixels_round(face_image, *pixel))[NEAREST[1:]]
+    around = stored(pixels_round(face_image, *pixel))
     others = jnp.concatenate([around, at_edge, covering])
     there = jnp.maximum(others, 0)
     hides = (others >= 0) & (volume[there] != 0) & (cast.patches[there] != cast.patches[face])
-    return _from_centre(corners_of(others, faces, pixels), pixel), stored(hides)
-
-
-def _from_centre(vertices: Array, pixel: Int[Array, "2 n"]) -> Array:
-    """x, y and w of vertices on the screen, from pixels' centres."""
-    x, y, w = vertices
-    centre = pixel.astype(w.dtype) + 0.5
-    return stored(jnp.stack([x - centre[0] * w, y - centre[1] * w, w]))
+    return from_centre(corners_of(others, faces, pixels), pixel), stored(hides)
 
 
 def _nearness(plane: Plane, x: Array, y: Array) -> Array:

@@ -86,22 +86,28 @@ def light_told(
     face_image: Int[Array, "height_with_border width_with_border"],
     pixel: Int[Array, "2 n"],
     face: Int[Array, " n"],
-) -> tuple[Int[Array, "lights n"], Int[Array, "lights n"]]:
+) -> tuple[Int[Array, "lights n"], Int[Array, "lights n"], Bool[Array, "lights n"]]:
     """Whether lights reach faces at pixels, as far as these and the four next to them tell.
 
     1 or 0 where all those agree that show the same surface, turned to the light; else -1. Between
     them no outline is known, so a ray to the light would tell of a strip that no centre shows. Also
-    what all of the 3×3 pixels tell, -2 where none of these shows it so.
+    what all of the 3×3 pixels tell, -2 where none of these shows it so; and whether an outline is
+    drawn on the faces though it is not they that the middle pixel shows.
     """
     column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(NEAREST))[..., None]
     shown = stored(face_image[row, column])
     seen, face = jnp.maximum(shown, 0), jnp.maximum(face, 0)
-    same = (shown >= 0) & (cast.patches[seen] == cast.patches[face])
+    patch = stored(cast.patches[seen])
+    same = (shown >= 0) & (patch == cast.patches[face])
     counts = same & cast.turned[:, seen]
     lit = cast.lit[:, row, column]
     # Whether a shadow may begin, on what the middle pixel shows, behind what others do.
     first, second = _PLACE[FIRST], _PLACE[SECOND]
-    _, ground = decoded(cast.between[:, DIRECTION[:, None], row[first], column[first]])
+    between, ground = decoded(cast.between[:, DIRECTION[:, None], row[first], column[first]])
+    exists, on_patch = between >= 0, jnp.where(ground == ON_SECOND, patch[second], patch[first])
+    on_middle = exists & (on_patch == patch[0]) & (shown[0] >= 0)
+    parted = jnp.any(exists & (ground == ON_BOTH) & same[first], axis=1)
+    parted = parted & ~jnp.any(on_middle, axis=1)
     hidden = ((ground == ON_FIRST) & same[first]) | ((ground == ON_SECOND) & same[second])
     hidden = jnp.any(hidden, axis=1) & same[0]
 
@@ -111,4 +117,4 @@ def light_told(
         alike = jnp.where(hidden, -1, alike)
         return jnp.where(cast.turned[:, face], alike, 0)
 
-    return stored((jnp.maximum(told(_CROSS), -1), told(len(NEAREST))))
+    return stored((jnp.maximum(told(_CROSS), -1), told(len(NEAREST)), parted))

@@ -11,7 +11,6 @@ their faces does, or that both end before. Where only one is seen, the second ma
 centre shows.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -48,6 +47,8 @@ from diffrast.edges.planes import (
     inverse_depth_slope,
 )
 from diffrast.edges.rim import SHORT, Rim, look_inwards, next_inwards, reach
+from diffrast.edges.shadow_beside import crossing
+from diffrast.edges.shadow_pairs import Cast
 from diffrast.edges.unseen import Unseen
 from diffrast.edges.ways import LOOK, Spot, inwards, located, outwards, sides_of, walked
 from diffrast.raster.fixed_point import subpixel_bits
@@ -92,7 +93,7 @@ class Seen(NamedTuple):
     half_way: Columns | None
 
 
-@partial(jax.jit, static_argnames="shadowed")
+@jax.jit
 def look(
     pieces: Pieces,
     segments: Segments,
@@ -100,13 +101,12 @@ def look(
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
     unseen: Unseen,
-    *,
-    shadowed: bool,
+    cast: Cast | None,
 ) -> tuple[Seen, Pieces]:
     """What is seen beside the first visible parts of pieces, and what is left of the pieces.
 
     `face_image` has a border of one pixel all round; `near_bare` is its `near_background`.
-    `shadowed` is whether lights cast shadows.
+    A part ends where the outline of a shadow crosses it on what lies behind.
     """
     faces, pixels, topology, volume = surface
     own, own_corners, vertices, weights, *ends, fold, first_on_right = stored_together(
@@ -197,6 +197,15 @@ def look(
     part = first_part(candidates, fold)
     half = stored((part.begin + part.end) / 2)
     first, last = pieces.range
+    if cast is not None:
+        nearest, best = (rows[0] for rows in nearest_behind(candidates, half[None]))
+        ground = jnp.where(fold & (nearest > 0), picked(around, best), -1)
+        places = [stored(start + (first + at * (last - first)) * along) for at in part[:2]]
+        at = crossing(ground, *places, pieces.pixel, cast, surface, face_image)
+        shown = (part.end - part.begin) * (last - first) * length
+        at = jnp.where(jnp.minimum(at, 1 - at) * shown > SHORT, at, 1)
+        part = part._replace(end=stored(part.begin + at * (part.end - part.begin)))
+        half = stored((part.begin + part.end) / 2)
     low, high, end, t = (first + at * (last - first) for at in (*part, half))
     exists = pieces.exists & (part.begin < part.end)
     # A rest too short to be looked at belongs to it: a gap may be most of what a centre sees.
@@ -313,7 +322,7 @@ def look(
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
     beside = sides_of(jnp.stack([front, beyond]), walks, surface)
     half_way = None
-    if shadowed:
+    if cast is not None:
         at = centre + middle + reach(middle, out) / 2 * out
         half_way = located(beyond, at, surface)
     bare = pictured < 0

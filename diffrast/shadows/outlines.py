@@ -26,6 +26,7 @@ from diffrast._device import anywhere, lanes, over_views
 from diffrast._selection import divided, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
+from diffrast.edges.follow import covering, follow, leaves
 from diffrast.edges.neighborhood import Surface, first_row, picked, walk
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.planes import Table, barycentrics, corners_of, edge_functions, edge_values
@@ -37,7 +38,6 @@ from diffrast.shadows.cast import Shadows, by_resolution, shone_on
 from diffrast.shadows.maps import Pictures
 from diffrast.shadows.near import Rays, face_corners, faces_near, line_of, seen_by_light
 from diffrast.shadows.views import cube_side, sides
-from diffrast.shadows.ways import covering, follow, leaves
 
 _AT_ONCE = 256
 _LOOKS = 8  # from one outline to the next

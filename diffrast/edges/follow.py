@@ -1,4 +1,4 @@
-"""Ways over faces from one to the next across their common edges, as a light sees them."""
+"""Ways over faces from one to the next across common edges, as a light or the eye sees them."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ def leaves(
     """Where on the way between two points, 0 to 1, a face ends; 3 if it does not.
 
     Also the corner opposite to the edge there, and the volume of the face, whose sign tells which
-    side it turns to the light; zero if the light sees it edge-on, as far as rounding can tell.
+    side it turns to these; zero if they see it edge-on, as far as rounding can tell.
     """
     (first, volume), (last, _) = (edge_functions(corners, *end) for end in ends)
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
