@@ -68,8 +68,8 @@ def test_shadows_of_several_bodies_meet_in_pixels_as_they_should():
         scene, camera = at_random(seed)
         picture = dr.render(scene, camera, dr.RenderSettings(height=32, width=32))
         errors.append(np.abs(picture - _mean_over_pixels(scene, camera, 32)))
-    assert np.mean(errors) < 6.6e-4  # without edges .013, with 16 samples .0017
-    assert np.sum(np.max(errors, axis=-1) > 0.1) <= 7
+    assert np.mean(errors) < 5.7e-4  # without edges .013, with 16 samples .0017
+    assert np.sum(np.max(errors, axis=-1) > 0.1) <= 5
 
 
 def test_a_shadow_that_begins_under_what_casts_it():
@@ -102,6 +102,41 @@ def test_a_shadow_that_begins_under_what_casts_it():
         moved = way[0] * (sheet - lit) + way[1] * slope / pixel * (dark - lit)
         np.testing.assert_allclose(got[10], want, atol=2e-5)
         np.testing.assert_allclose(change[10], moved, rtol=1e-3)
+
+
+def test_an_outline_that_goes_on_behind_a_sheet():
+    """Seen from above; the centre of the pixel where they cross shows the sheet or the floor.
+
+    What casts the shadow lies behind the camera: it hides nothing. Area and derivative in closed
+    form, by how much of the pixel the sheet covers, and by how much of the rest is lit.
+    """
+    size, pixel, slope, high = 16, 0.25, 0.5, 8.0
+    down = linalg.rotation_x(-np.pi / 2)
+    camera = dr.Camera.orthographic(
+        eye=(0, 5, 0), up=(0, 0, -1), target=(0, 0, 0), height=size * pixel, near=0.1, far=20.0
+    )
+    black = dr.Material(ambient=(0, 0, 0), diffuse=(0, 0, 0))
+    light = sun((-slope, -1.0, slope))
+
+    @jax.jit
+    def picture(covered, lit):
+        edge = (2 + covered) * pixel  # of the sheet, in column 10; its shadow lies under it
+        place = jnp.stack([edge - 2.0, 1.0, 0.0])
+        sheet = dr.Object(shapes.plane(4.0, 12.0), black, linalg.translation(place) @ down)
+        front = lit * pixel - slope * high  # its shadow begins in row 8
+        place = jnp.stack([slope * high, high, front + 6.0])
+        roof = dr.Object(shapes.plane(24.0, 12.0), None, linalg.translation(place) @ down)
+        scene = dr.Scene(objects=[sheet, roof, floor(height=0.0)], lights=[light])
+        return dr.render(scene, camera, dr.RenderSettings(height=size, width=size))[..., 0]
+
+    dark, way = 0.1 * 0.8, (0.3, -0.2)  # ambient light
+    for covered, lit in itertools.product((0.3, 0.6, 0.9), (0.2, 0.45, 0.8)):
+        got, change = jax.jvp(picture, (covered, lit), way)
+        bright = got[0, -1]
+        ground = lit * bright + (1 - lit) * dark
+        np.testing.assert_allclose(got[8, 10], (1 - covered) * ground, atol=2e-5)
+        moved = -way[0] * ground + (1 - covered) * way[1] * (bright - dark)
+        np.testing.assert_allclose(change[8, 10], moved, rtol=1e-3)
 
 
 def test_outlines_under_parallel_projection_and_on_flat_shaded_floors():

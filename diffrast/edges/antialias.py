@@ -172,7 +172,10 @@ def with_depth(view: View) -> View:
 
     def volume_of(positions_clip: Array, faces: Array) -> Array:
         pixels = stored(to_pixels(positions_clip, height, width))
-        return facing(pixels, faces, height=height, width=width)
+        volume = facing(pixels, faces, height=height, width=width)
+        z, w = positions_clip[:, 2:].T
+        first, second, third = ((z < -w) + 2 * (z > w))[faces.T]
+        return jnp.where((first & second & third) > 0, 0, volume)  # before near or beyond far
 
     volume = over_views(volume_of, height * width)(lax.stop_gradient(positions_clip), view.faces)
     if view.cast is not None:
