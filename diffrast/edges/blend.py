@@ -46,7 +46,7 @@ class View(NamedTuple):
     background: Float[Array, "*size channels"]  # one colour, or a picture like `image`
     scene: Any  # passed on to the shader
     scale: Float[Array, " V"] | None = None  # of homogeneous coordinates: `scale_by_depth`
-    volume: Float[Array, " F"] | None = None  # of faces: `facing`
+    volume: Float[Array, " F"] | None = None  # of faces: `facing`; 0 of none that can be drawn
     cast: Cast | None = None  # shadows; then lights and their weights follow the positions
     # Pixels that get the mean colour of the surface at their centre elsewhere.
     meaned: Bool[Array, "height width"] | None = None
