@@ -7,6 +7,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, in_strides
+from diffrast._selection import divided
 from diffrast._stored import stored
 from diffrast.edges.planes import edge_functions, largest, lowest
 
@@ -102,7 +103,7 @@ def follow(
 
 def _named_once(edge: Int[Array, " n"], neighbors: Int[Array, "F 3"]) -> Int[Array, " n"]:
     """Edges by the lower one of their two faces."""
-    face, corner = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    face, corner = divided(jnp.maximum(edge, 0), 3)
     other = neighbors[face, corner]
     back = neighbors[jnp.maximum(other, 0)] == face[:, None]
     corner = jnp.where(back[:, 0], 0, jnp.where(back[:, 1], 1, 2))

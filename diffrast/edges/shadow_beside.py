@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from diffrast._selection import divided
 from diffrast._stored import stored
-from diffrast.edges.neighborhood import Surface, pixels_round, steps_to
+from diffrast.edges.neighborhood import Surface, steps_to
 from diffrast.edges.planes import corners_of, from_centre
 from diffrast.edges.shadow_pairs import DIRECTION, FIRST, ON_BOTH, Cast, decoded
 from diffrast.edges.shadow_planes import Plane, face_plane, meeting, shadow_plane
@@ -20,15 +21,14 @@ def crossing(
     pixel: Int[Array, "2 n"],
     cast: Cast,
     surface: Surface,
-    face_image: Int[Array, "height_with_border width_with_border"],
+    shown: Int[Array, "9 n"],
 ) -> Float[Array, " n"]:
     """Where, 0 to 1, the first outline on faces crosses pieces, whose ends are from the centre.
 
-    1 if none does. Of each light two edges at most are known whose shadows part pixels round there
-    that show the faces' surface.
+    1 if none does. `shown` are the faces at the 3×3 pixels round each. Of each light two edges at
+    most are known whose shadows part pixels round there that show the faces' surface.
     """
     faces, pixels, _, _ = surface
-    shown = stored(pixels_round(face_image, *pixel))
     patch = cast.patches[jnp.maximum(face, 0)]
     same = (face >= 0) & (shown >= 0) & (cast.patches[jnp.maximum(shown, 0)] == patch)
     column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(FIRST))[..., None]
@@ -37,7 +37,7 @@ def crossing(
     last = jnp.max(jnp.where(known, edge, -1), axis=1)
     first = jnp.min(jnp.where(known, edge, jnp.iinfo(edge.dtype).max), axis=1)
     edge = stored(jnp.stack([jnp.minimum(first, last), last]))  # (2, lights, n)
-    caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    caster, third = divided(jnp.maximum(edge, 0), 3)
     start, stop = (from_centre(pixels[:, faces[caster, (third + k) % 3]], pixel) for k in (1, 2))
     lights = cast.weight.size
     source = from_centre(pixels[:, -2 * lights : -lights, None], pixel)[:, None]

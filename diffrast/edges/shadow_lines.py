@@ -188,7 +188,7 @@ def cross_shadows(
     ground_face = jnp.stack([picked(around, k) for k in which])
     is_own = received & (ground_face == own)
 
-    caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    caster, third = divided(jnp.maximum(edge, 0), 3)
     vertices = stored(jnp.stack([faces[caster, (third + k) % 3] for k in (1, 2)]))
     ends = [place(vertex) for vertex in vertices]
     corners = place(faces.T[:, jnp.maximum(ground_face, 0)])
@@ -449,7 +449,7 @@ def _before(
     edges, and what is known to be `covering` places of the lines.
     """
     faces, pixels, topology, volume = surface
-    caster, third = jnp.maximum(edge, 0) // 3, jnp.maximum(edge, 0) % 3
+    caster, third = divided(jnp.maximum(edge, 0), 3)
     at_edge = jnp.stack([caster, topology.neighbors[caster, third]])
     around = stored(pixels_round(face_image, *pixel))
     others = jnp.concatenate([around, at_edge, covering])

@@ -201,7 +201,7 @@ def look(
         nearest, best = (rows[0] for rows in nearest_behind(candidates, half[None]))
         ground = jnp.where(fold & (nearest > 0), picked(around, best), -1)
         places = [stored(start + (first + at * (last - first)) * along) for at in part[:2]]
-        at = crossing(ground, *places, pieces.pixel, cast, surface, face_image)
+        at = crossing(ground, *places, pieces.pixel, cast, surface, pictured)
         shown = (part.end - part.begin) * (last - first) * length
         at = jnp.where(jnp.minimum(at, 1 - at) * shown > SHORT, at, 1)
         part = part._replace(end=stored(part.begin + at * (part.end - part.begin)))
