@@ -174,7 +174,7 @@ def with_depth(view: View) -> View:
         pixels = stored(to_pixels(positions_clip, height, width))
         volume = facing(pixels, faces, height=height, width=width)
         z, w = positions_clip[:, 2:].T
-        first, second, third = ((z < -w) + 2 * (z > w))[faces.T]
+        first, second, third = jnp.where(z < -w, 1, jnp.where(z > w, 2, 0))[faces.T]
         return jnp.where((first & second & third) > 0, 0, volume)  # before near or beyond far
 
     volume = over_views(volume_of, height * width)(lax.stop_gradient(positions_clip), view.faces)
