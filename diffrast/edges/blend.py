@@ -175,7 +175,8 @@ def _told(
     lies beyond a fold through the centre, where the outline may be the same line. Of points whose
     colours are not used no light is asked.
 
-    Also beyond which folds no pixel shows a shadow: it may begin there, but ends not far away; and
+    Also beyond which folds no pixel shows a shadow, and no outline is drawn: one may begin there,
+    but ends not far away; and
     in front and beyond of which some do, and others do not: it is not the shading that changes
     there.
     """
@@ -195,7 +196,7 @@ def _told(
     inwards = jnp.where(found.rim.smooth | found.rim.alone, -1, jnp.zeros_like(front))
     parts = [front, beyond] + [inwards] * (points - 2)
     told = jnp.concatenate([jnp.where(found.visible, part, 0) for part in parts], axis=1)
-    lit_around = asked & jnp.any(around > 0, axis=0)
+    lit_around = asked & jnp.any(around > 0, axis=0) & ~jnp.any(parted_beyond, axis=0)
     parted = [jnp.any(part == -1, axis=0) for part in (in_front, around)]
     return told, stored(jnp.stack([lit_around, *parted]))
 
@@ -327,10 +328,10 @@ def _lit_by_pixels(
     """
     told, lit_around = [], []
     for look, face in zip(line.look, line.face, strict=True):
-        _, around, _ = light_told(cast, view.face_image, line.pixel, face)
-        asked = (look != 4) & (around > 0)
+        _, around, parted = light_told(cast, view.face_image, line.pixel, face)
+        asked = (look != 4) & ((around > 0) | parted)
         told.append(jnp.where(line.used, jnp.maximum(jnp.where(asked, -1, around), -1), 0))
-        lit_around.append(stored(jnp.any(asked, axis=0)))
+        lit_around.append(stored(jnp.any(asked, axis=0) & ~jnp.any(parted, axis=0)))
     return jnp.concatenate(told, axis=1), lit_around
 
 

@@ -155,9 +155,10 @@ def cross_shadows(
     on_patch = jnp.where(on_one == ON_SECOND, patch[SECOND], patch[FIRST])
     on_own = exists & (on_patch == patch[4]) & (own >= 0)
     # Where no outline passes on what the centre shows, one may on what is seen beside that.
-    on_other = exists & (on_one == ON_BOTH) & ~jnp.any(on_own, axis=0)
+    on_other = exists & ~jnp.any(on_own, axis=0)
     other = first_row(on_other)
-    home = stored(jnp.where(other < len(FIRST), jnp.asarray(FIRST)[other], 4))
+    grounds = jnp.where(on_one == ON_SECOND, SECOND[:, None], FIRST[:, None])
+    home = stored(jnp.where(other < len(FIRST), picked(grounds, other), 4))
     ground_patch = picked(patch, home)
     same = (shown >= 0) & (patch == ground_patch)
     counts = stored(same & cast.turned[light, seen])

@@ -106,8 +106,8 @@ def light_told(
     between, ground = decoded(cast.between[:, DIRECTION[:, None], row[first], column[first]])
     exists, on_patch = between >= 0, jnp.where(ground == ON_SECOND, patch[second], patch[first])
     on_middle = exists & (on_patch == patch[0]) & (shown[0] >= 0)
-    parted = jnp.any(exists & (ground == ON_BOTH) & same[first], axis=1)
-    parted = parted & ~jnp.any(on_middle, axis=1)
+    on_faces = exists & jnp.where(ground == ON_SECOND, same[second], same[first])
+    parted = jnp.any(on_faces, axis=1) & ~jnp.any(on_middle, axis=1)
     hidden = ((ground == ON_FIRST) & same[first]) | ((ground == ON_SECOND) & same[second])
     hidden = jnp.any(hidden, axis=1) & same[0]
 
