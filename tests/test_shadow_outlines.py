@@ -72,36 +72,52 @@ def test_shadows_of_several_bodies_meet_in_pixels_as_they_should():
     assert np.sum(np.max(errors, axis=-1) > 0.1) <= 5
 
 
-def test_a_shadow_that_begins_under_what_casts_it():
-    """A sheet over a floor, seen from above, and its shadow, of which no pixel's centre may be.
+_PIXEL, _SLOPE, _DARK = 0.25, 0.5, 0.1 * 0.8  # of a row over a sheet; the last: ambient light
 
-    Areas and their derivative in closed form, by how much of a pixel the sheet covers and by its
-    height, and so by how far its shadow goes beyond it.
-    """
-    size, pixel, slope = 16, 0.25, 0.5
+
+@jax.jit
+def _row_over_a_sheet(covered, height):
+    """A sheet over a floor, seen from above, of which it covers a part of column 10."""
+    size = 16
     down = linalg.rotation_x(-np.pi / 2)
     camera = dr.Camera.orthographic(
-        eye=(0, 5, 0), up=(0, 0, -1), target=(0, 0, 0), height=size * pixel, near=0.1, far=20.0
+        eye=(0, 5, 0), up=(0, 0, -1), target=(0, 0, 0), height=size * _PIXEL, near=0.1, far=20.0
     )
-    light = sun((slope, -1.0, 0.0))
+    place = jnp.array([0.5 + covered * _PIXEL - 2.0, height, 0.1])
+    grey = dr.Material(diffuse=(0.2, 0.2, 0.2))
+    sheet = dr.Object(shapes.plane(4.0, 8.0), grey, linalg.translation(place) @ down)
+    light = sun((_SLOPE, -1.0, 0.0))
+    scene = dr.Scene(objects=[sheet, floor(height=0.0)], lights=[light])
+    return dr.render(scene, camera, dr.RenderSettings(height=size, width=size))[size // 2, :, 0]
 
-    @jax.jit
-    def row(covered, height):
-        place = jnp.array([0.5 + covered * pixel - 2.0, height, 0.1])
-        grey = dr.Material(diffuse=(0.2, 0.2, 0.2))
-        sheet = dr.Object(shapes.plane(4.0, 8.0), grey, linalg.translation(place) @ down)
-        scene = dr.Scene(objects=[sheet, floor(height=0.0)], lights=[light])
-        return dr.render(scene, camera, dr.RenderSettings(height=size, width=size))[size // 2, :, 0]
 
-    dark = 0.1 * 0.8  # ambient light
-    for covered, shaded in itertools.product((0.05, 0.2, 0.4), (0.05, 0.2, 0.4)):
-        at, way = (covered, shaded * pixel / slope), (0.3, 0.1)
-        got, change = jax.jvp(row, at, way)
+def test_a_shadow_that_begins_under_what_casts_it():
+    """A sheet over a floor, and its shadow, of which no pixel's centre may be.
+
+    Areas and their derivative in closed form, by how much of a pixel the sheet covers, its centre
+    or not, and by its height, and so by how far its shadow goes beyond it.
+    """
+    parts = itertools.product((0.05, 0.2, 0.4), (0.05, 0.2, 0.4))
+    for covered, shaded in [*parts, (0.6, 0.02), (0.6, 0.2), (0.8, 0.1), (0.95, 0.02)]:
+        at, way = (covered, shaded * _PIXEL / _SLOPE), (0.3, 0.1)
+        got, change = jax.jvp(_row_over_a_sheet, at, way)
         sheet, lit = got[2], got[-1]
-        want = covered * sheet + shaded * dark + (1 - covered - shaded) * lit
-        moved = way[0] * (sheet - lit) + way[1] * slope / pixel * (dark - lit)
+        want = covered * sheet + shaded * _DARK + (1 - covered - shaded) * lit
+        moved = way[0] * (sheet - lit) + way[1] * _SLOPE / _PIXEL * (_DARK - lit)
         np.testing.assert_allclose(got[10], want, atol=2e-5)
         np.testing.assert_allclose(change[10], moved, rtol=1e-3)
+
+
+def test_outlines_through_the_centres_of_pixels():
+    """Rounding has them on either side of these: what the pixels next to them show tells."""
+    parts = itertools.product((0.05, 0.1, 0.2, 0.25, 0.3, 0.4, 0.6, 0.8), (0.5, 1.5))
+    for covered, end in [(c, e) for c, e in parts if c < e]:  # from where column 10 begins
+        got = _row_over_a_sheet(covered, (end - covered) * _PIXEL / _SLOPE)
+        sheet, lit = got[2], got[-1]
+        dark, left = min(end, 1) - covered, 1 - min(end, 1)
+        want = [covered * sheet + dark * _DARK + left * lit]
+        want.append(lit if end < 1 else (lit + _DARK) / 2)
+        np.testing.assert_allclose(got[10:12], want, atol=1e-4)
 
 
 def test_an_outline_that_goes_on_behind_a_sheet():

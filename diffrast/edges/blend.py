@@ -176,9 +176,8 @@ def _told(
     colours are not used no light is asked.
 
     Also beyond which folds no pixel shows a shadow, and no outline is drawn: one may begin there,
-    but ends not far away; and
-    in front and beyond of which some do, and others do not: it is not the shading that changes
-    there.
+    but ends not far away; and in front and beyond of which some do, and others do not: it is not
+    the shading that changes there.
     """
     (front, in_front, _), (beyond, around, parted_beyond) = (
         light_told(cast, view.face_image, pixel, side.face) for side in (found.front, found.beyond)

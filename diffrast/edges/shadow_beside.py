@@ -9,7 +9,7 @@ from diffrast._selection import divided
 from diffrast._stored import stored
 from diffrast.edges.neighborhood import Surface, steps_to
 from diffrast.edges.planes import corners_of, from_centre
-from diffrast.edges.shadow_pairs import DIRECTION, FIRST, ON_BOTH, ON_SECOND, SECOND, Cast, decoded
+from diffrast.edges.shadow_pairs import DIRECTION, FIRST, ON_BOTH, SECOND, Cast, decoded, on_ground
 from diffrast.edges.shadow_planes import Plane, face_plane, meeting, shadow_plane
 
 
@@ -33,8 +33,8 @@ def crossing(
     same = (face >= 0) & (shown >= 0) & (cast.patches[jnp.maximum(shown, 0)] == patch)
     column, row = pixel[:, None] + 1 + steps_to(jnp.asarray(FIRST))[..., None]
     edge, ground = decoded(cast.between[:, DIRECTION[:, None], row, column])  # (lights, pairs, n)
-    on_face = jnp.where(ground == ON_SECOND, same[SECOND], same[FIRST])
-    known = (edge >= 0) & on_face & ((ground == ON_BOTH) | ~same[4])
+    on_face = (edge >= 0) & on_ground(ground, same[FIRST], same[SECOND])
+    known = on_face & ((ground == ON_BOTH) | ~same[4])
     last = jnp.max(jnp.where(known, edge, -1), axis=1)
     first = jnp.min(jnp.where(known, edge, jnp.iinfo(edge.dtype).max), axis=1)
     edge = stored(jnp.stack([jnp.minimum(first, last), last]))  # (2, lights, n)

@@ -55,6 +55,7 @@ from diffrast.edges.shadow_pairs import (
     SECOND,
     Cast,
     decoded,
+    on_ground,
 )
 from diffrast.edges.shadow_planes import (
     Plane,
@@ -152,12 +153,12 @@ def cross_shadows(
     codes = stored(cast.between[light, DIRECTION[:, None], row[FIRST], column[FIRST]])
     between, on_one = decoded(codes)
     exists = exists & (between >= 0)
-    on_patch = jnp.where(on_one == ON_SECOND, patch[SECOND], patch[FIRST])
+    on_patch = on_ground(on_one, patch[FIRST], patch[SECOND])
     on_own = exists & (on_patch == patch[4]) & (own >= 0)
     # Where no outline passes on what the centre shows, one may on what is seen beside that.
     on_other = exists & ~jnp.any(on_own, axis=0)
     other = first_row(on_other)
-    grounds = jnp.where(on_one == ON_SECOND, SECOND[:, None], FIRST[:, None])
+    grounds = on_ground(on_one, *jnp.asarray([FIRST, SECOND])[..., None])
     home = stored(jnp.where(other < len(FIRST), picked(grounds, other), 4))
     ground_patch = picked(patch, home)
     same = (shown >= 0) & (patch == ground_patch)

@@ -16,6 +16,7 @@ from diffrast._stored import stored
 from diffrast.edges.neighborhood import steps_to
 from diffrast.edges.pieces import positive_part
 from diffrast.edges.planes import dot_rows
+from diffrast.edges.shadow_ends import ROUNDED
 
 _CERTAIN = 8  # times as much as another one tells the middle one of the 3×3 pixels
 _OPPOSITE = -0.5  # cosine between the normals of two outlines of one shadow
@@ -79,7 +80,7 @@ def overlap(
     decided, either = if_both != if_either, if_either < if_both
     chosen = valid & (chosen | decided)
     # One that goes on beyond where its edge ends may leave the centre dark that is lit.
-    leaves_lit = told[4] | jnp.any(told[4] & corner, axis=1)
+    leaves_lit = (beyond < ROUNDED) | jnp.any(told[4] & corner, axis=1)
     leaves_lit = jnp.all(leaves_lit | ~together, axis=1)
     chosen = chosen & (leaves_lit | ~(lit[4] & counts[4]))
     return Overlap(

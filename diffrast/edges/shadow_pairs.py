@@ -70,6 +70,11 @@ def decoded(code: Int[Array, "*n"]) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]
     return jnp.where(code < 0, -1, edge), ground
 
 
+def on_ground(ground: Int[Array, "*n"], first: Array, second: Array) -> Array:
+    """Of values of two pixels that of one which shows what the shadow falls on."""
+    return jnp.where(ground == ON_SECOND, second, first)
+
+
 def choose_pixels(cast: Cast) -> tuple[Int[Array, " places"], Int[Array, ""]]:
     """Indices (light, row, column) of pixels round which an outline passes, and how many."""
     right, below = (cast.between[:, k] >= 0 for k in range(2))
@@ -104,12 +109,11 @@ def light_told(
     # Whether a shadow may begin, on what the middle pixel shows, behind what others do.
     first, second = _PLACE[FIRST], _PLACE[SECOND]
     between, ground = decoded(cast.between[:, DIRECTION[:, None], row[first], column[first]])
-    exists, on_patch = between >= 0, jnp.where(ground == ON_SECOND, patch[second], patch[first])
-    on_middle = exists & (on_patch == patch[0]) & (shown[0] >= 0)
-    on_faces = exists & jnp.where(ground == ON_SECOND, same[second], same[first])
+    on_middle = on_ground(ground, patch[first], patch[second]) == patch[0]
+    on_middle = (between >= 0) & on_middle & (shown[0] >= 0)
+    on_faces = (between >= 0) & on_ground(ground, same[first], same[second])
     parted = jnp.any(on_faces, axis=1) & ~jnp.any(on_middle, axis=1)
-    hidden = ((ground == ON_FIRST) & same[first]) | ((ground == ON_SECOND) & same[second])
-    hidden = jnp.any(hidden, axis=1) & same[0]
+    hidden = jnp.any(on_faces & (ground != ON_BOTH), axis=1) & same[0]
 
     def told(rows: int) -> Array:
         bright, dark = (jnp.any((counts & part)[:, :rows], axis=1) for part in (lit, ~lit))

@@ -41,6 +41,7 @@ from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
 _LOOKS = 8  # from one outline to the next
+_ROUNDED = 1e-3  # of the way: how far past what is lit, by rounding, its outline may be
 _BEYOND = 1 / 64  # of the way from an outline to what is lit: where the next one is looked for
 
 _Look = tuple[Array, Rays, Array]
@@ -281,6 +282,7 @@ def _edge_between(
     for end in (at_dark, at_bright):
         x, y, w = seen(end)
         ends.append(stored([x / jnp.where(w > 0, w, 1), y / jnp.where(w > 0, w, 1)]))
+    past = stored([b + _ROUNDED * (b - a) for a, b in zip(*ends, strict=True)])
     zero, unsure = jnp.zeros_like(at_dark[0]), guessed[0] | guessed[1]
 
     def corners_of(face: Array) -> Array:
@@ -288,7 +290,7 @@ def _edge_between(
 
     def look(state: _Look) -> _Look:
         looks, rays, edge = state
-        way = [[rays.x, rays.y], ends[1]]
+        way = [[rays.x, rays.y], past]
         line = stored(line_of(pictures, rays, face_corners(geometry, rays.face)))
         nearby = faces_near(pictures, geometry, rays, line)
         part, _, volume = leaves(stored(seen(nearby.corners)), way)
