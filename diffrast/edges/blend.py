@@ -323,7 +323,7 @@ def _lit_by_pixels(
     """What pixels tell of the light on both sides: of what the centre shows, and that it is dark.
 
     On the line itself a shadow may begin that is all but out of sight. Also on which sides no pixel
-    shows one.
+    shows one, and no outline is drawn.
     """
     told, lit_around = [], []
     for look, face in zip(line.look, line.face, strict=True):

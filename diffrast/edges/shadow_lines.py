@@ -168,7 +168,7 @@ def cross_shadows(
     looks = jnp.stack([jnp.asarray(FIRST)[pair], jnp.asarray(SECOND)[pair]])
     edge, on_one = stored(decoded(jnp.stack([picked(codes, k) for k in pair])))
     is_second, is_hidden = on_one == ON_SECOND, on_one != ON_BOTH
-    near, far = jnp.where(is_second, looks[::-1], looks)
+    near, far = on_ground(on_one, looks, looks[::-1])
     first_is_lit = jnp.stack([picked(lit, k) for k in near]) != is_second
     hider = jnp.where(is_hidden, jnp.stack([picked(shown, k) for k in far]), -1)
     hider = jnp.where(same[4], hider, own)

@@ -30,7 +30,7 @@ from diffrast.edges.follow import covering, follow, leaves
 from diffrast.edges.neighborhood import Surface, first_row, picked, walk
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.planes import Table, barycentrics, corners_of, edge_functions, edge_values
-from diffrast.edges.shadow_pairs import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded
+from diffrast.edges.shadow_pairs import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded, on_ground
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.raster.evaluate import unit_of
@@ -41,7 +41,7 @@ from diffrast.shadows.views import cube_side, sides
 
 _AT_ONCE = 256
 _LOOKS = 8  # from one outline to the next
-_ROUNDED = 1e-3  # of the way: how far past what is lit, by rounding, its outline may be
+_PAST = 1e-3  # of the way: how far past what is lit, by rounding, its outline may be
 _BEYOND = 1 / 64  # of the way from an outline to what is lit: where the next one is looked for
 
 _Look = tuple[Array, Rays, Array]
@@ -157,10 +157,10 @@ def _between_pixels(
 
     def look(number: Array, exists: Array, codes: Array) -> Array:
         (ground, extended), (lamp, at) = ground_of(number), of_pair(number)
-        unsure, is_second = ground != ON_BOTH, ground == ON_SECOND
-        home, away = jnp.where(is_second, at[::-1], at)
+        unsure = ground != ON_BOTH
+        home, away = on_ground(ground, at, at[::-1])
         own = stored(face[home])
-        there = jnp.where(is_second, extended[:, 1], extended[:, 0])
+        there = on_ground(ground, extended[:, 0], extended[:, 1])
         there = jnp.where(unsure, there, shares[:, away])
         ends = [
             Points(own, list(shares[:, home]), home),
@@ -282,7 +282,7 @@ def _edge_between(
     for end in (at_dark, at_bright):
         x, y, w = seen(end)
         ends.append(stored([x / jnp.where(w > 0, w, 1), y / jnp.where(w > 0, w, 1)]))
-    past = stored([b + _ROUNDED * (b - a) for a, b in zip(*ends, strict=True)])
+    past = stored([b + _PAST * (b - a) for a, b in zip(*ends, strict=True)])
     zero, unsure = jnp.zeros_like(at_dark[0]), guessed[0] | guessed[1]
 
     def corners_of(face: Array) -> Array:
