@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -177,6 +178,66 @@ def test_boxes_in_a_row_have_no_seam(whole):
         near = dr.Camera.perspective(fov_y=0.8, **place)
         for view in (near, dr.Camera.orthographic(height=6, **place)):
             np.testing.assert_allclose(smooth(view), sampled(view), atol=0.03)
+
+
+def test_tiles_side_by_side_have_one_edge_in_common():
+    """Planes that are bodies of their own: colours are what their areas make them.
+
+    From above in closed form, whichever of the two comes first, and wherever the line between them
+    is, through centres of pixels, too; derivatives by their common place.
+    """
+    size, black = 8, dr.Material(ambient=(0, 0, 0))
+    view = dr.Camera.orthographic(eye=(0, 0, 5), target=(0, 0, 0), height=size, near=1, far=9)
+    settings = dr.RenderSettings(height=size, width=size)
+    tile = dr.shapes.plane(20.0, 20.0)
+
+    def row(line, first_is_black, lift):
+        materials = [black, dr.Material(ambient=(1, 1, 1))]
+        sides = [-10.0, 10.0] if first_is_black else [10.0, -10.0]
+        tiles = [
+            dr.Object(tile, material, dr.linalg.translation(jnp.stack([line + side, 0.0, z])))
+            for material, side, z in zip(materials, sides, (0.0, lift), strict=True)
+        ]
+        scene = dr.Scene(objects=tiles, lights=[dr.AmbientLight((1.0, 1.0, 1.0))])
+        return dr.render(scene, view, settings)[3, :, 0]
+
+    value_and_change = jax.jit(
+        lambda line, lift, black_left: jax.jvp(
+            lambda line: row(line, black_left, lift), (line,), (1.0,)
+        ),
+        static_argnums=2,
+    )
+    borders = np.arange(size) - size / 2
+    for line, lift, black_left in itertools.product(
+        (0.1, 0.25, 0.5, 0.77, 1.0), (0.0, 0.3), (True, False)
+    ):
+        got, change = value_and_change(line, lift, black_left)
+        share = np.clip(line - borders, 0, 1)
+        rate = np.where((line > borders) & (line <= borders + 1), 1.0, 0.0)
+        np.testing.assert_allclose(got, 1 - share if black_left else share, atol=1e-4)
+        if line != 1.0:  # a kink, on the border of two pixels
+            np.testing.assert_allclose(change, -rate if black_left else rate, atol=1e-4)
+
+
+def test_tiles_seen_from_aside_are_as_exact_as_many_samples():
+    colors = np.random.default_rng(0).uniform(0.1, 0.9, (9, 3))
+    flat = dr.linalg.rotation_x(-np.pi / 2)
+    tiles = [
+        dr.Object(
+            dr.shapes.plane(1.0, 1.0),
+            dr.Material(ambient=color),
+            dr.linalg.compose(dr.linalg.translation((k // 3 - 1.0, 0, k % 3 - 1.0)), flat),
+        )
+        for k, color in enumerate(colors)
+    ]
+    scene = dr.Scene(objects=tiles, lights=[dr.AmbientLight((1.0, 1.0, 1.0))])
+    view = dr.Camera.perspective(
+        eye=(1.3, 2.7, 2.1), target=(0, 0, 0), fov_y=0.8, aspect=1.0, near=0.1, far=20.0
+    )
+    settings = dr.RenderSettings(height=32, width=32)
+    samples = dataclasses.replace(settings, antialias=False, samples=24**2)
+    got, want = (dr.render(scene, view, options) for options in (settings, samples))
+    np.testing.assert_allclose(got, want, atol=0.02)
 
 
 def test_boxes_seen_from_straight_above_have_exact_edges():

@@ -320,7 +320,9 @@ def look(
     gap = walks.ends & is_near_background(near_bare, *pieces.pixel)
     beyond = jnp.where(walks.behind >= 0, walks.behind, beyond)
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
-    beside = sides_of(jnp.stack([front, beyond]), walks, surface)
+    beside, both_end = sides_of(front, beyond, near, walks, surface)
+    # Of two edges in one line, as those of tiles side by side are, one is drawn: the first face's.
+    visible = visible & ~(fold & both_end & (beyond < front))
     half_way = None
     if cast is not None:
         at = centre + middle + reach(middle, out) / 2 * out

@@ -18,6 +18,7 @@ from diffrast.edges.neighborhood import (
 )
 from diffrast.edges.planes import (
     FINE_TOLERANCE,
+    TOLERANCE,
     Columns,
     barycentrics,
     corners_of,
@@ -205,12 +206,28 @@ def walked(
     )
 
 
-def sides_of(faces: Int[Array, "2 n"], found: Walked, surface: Surface) -> Columns:
-    """Barycentric coordinates of faces at the points just inside and just beyond.
+def sides_of(
+    front: Int[Array, " n"],
+    beyond: Int[Array, " n"],
+    near: Float[Array, " n"],
+    found: Walked,
+    surface: Surface,
+) -> tuple[Columns, Bool[Array, " n"]]:
+    """Barycentric coordinates of faces at the points just inside and just beyond, one each.
 
-    On the edge itself rounding would decide whether a face that ends there shades it.
+    On the edge itself rounding would decide whether a face that ends there shades it. And whether
+    the surface beyond ends at this edge as well, of 1/w `near`: so do tiles side by side.
     """
-    return located(faces, jnp.stack([found.inside, found.beyond], axis=1), surface)
+    faces = jnp.stack([front, beyond, beyond])
+    x, y = jnp.stack([found.inside, found.beyond, found.inside], axis=1)
+    values, depth = edge_values(corners_of(faces, surface.faces, surface.pixels), x, y)
+    least, corner = lowest([value[2] for value in values])
+    known = jnp.maximum(beyond, 0)
+    across = surface.topology.neighbors[known, corner]
+    goes_on = turned_alike(across, jnp.sign(surface.volume[known]), surface.volume)
+    touches = abs(depth[1] - near) < TOLERANCE * near
+    both_end = (beyond >= 0) & touches & (least < 0) & ~goes_on
+    return barycentrics([jnp.maximum(value[:2], 0) for value in values]), both_end
 
 
 def located(face: Array, point: Array, surface: Surface) -> Columns:
