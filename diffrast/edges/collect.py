@@ -23,7 +23,7 @@ from diffrast.edges.blend import (
     with_pieces,
     with_shadow,
 )
-from diffrast.edges.neighborhood import Surface, near_background
+from diffrast.edges.neighborhood import Surface, farthest_round, near_background
 from diffrast.edges.piercing import LINES_AT_ONCE, PIXELS_AT_ONCE, choose_pixels, cross, lines_of
 from diffrast.edges.records import Start, after_batch, has_room
 from diffrast.edges.shadow_lines import LINES_AT_ONCE as SHADOWS_AT_ONCE
@@ -97,6 +97,7 @@ def _edges(
     runs, unseen = view.survey
     edges = Edges(view, surface, selected(runs > 0))
     near_bare = near_background(view.face_image)
+    seen_farthest = farthest_round(view.face_image, surface)
 
     def add_edges(edge: Array, exists: Array, total: Blended) -> Blended:
         segments = edges.clipped(edge, exists)._replace(runs=stored(runs[edge]))
@@ -111,6 +112,7 @@ def _edges(
                 surface,
                 view.face_image,
                 near_bare,
+                seen_farthest,
                 unseen,
                 view.cast,
             )

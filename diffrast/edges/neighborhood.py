@@ -106,11 +106,25 @@ def nearest_round(
     )[1]
 
 
-def is_near_background(
-    near: Bool[Array, "rows columns"], column: Int[Array, " n"], row: Int[Array, " n"]
-) -> Bool[Array, " n"]:
-    """The same of pixels, counted without the border of one pixel that this image has."""
-    return near[divided(row + 1, _BLOCK)[0], divided(column + 1, _BLOCK)[0]]
+def farthest_round(
+    face_image: Int[Array, "height width"], surface: Surface
+) -> Int[Array, "rows columns"]:
+    """Of the faces seen in the middle of blocks of pixels, and of those round them, the farthest.
+
+    The image has a border of one pixel, which shows nothing.
+    """
+    middle = _BLOCK // 2
+    height, width = face_image.shape
+    face = jnp.pad(face_image, ((0, -height % _BLOCK), (0, -width % _BLOCK)), constant_values=-1)
+    face = stored(face[middle::_BLOCK, middle::_BLOCK])
+    y, x = (_BLOCK * jnp.indices(face.shape) + middle).astype(surface.pixels.dtype) - 0.5
+    depth = edge_values(corners_of(face, surface.faces, surface.pixels), x, y)[1]
+    return nearest_round(stored(jnp.where(face >= 0, -depth, -jnp.inf)), face)
+
+
+def of_block(values: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:
+    """The values that blocks have, at pixels, counted without the border of one pixel."""
+    return values[divided(row + 1, _BLOCK)[0], divided(column + 1, _BLOCK)[0]]
 
 
 def ring_of_edge(face: Int[Array, "2 n"], neighbors: Int[Array, "F 3"]) -> Int[Array, "12 n"]:

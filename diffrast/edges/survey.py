@@ -110,13 +110,17 @@ def survey(view: View, method: Method) -> Survey:
             face, depth = stored_together(
                 unpictured(pieces, segments, surface.volume, view.face_image)
             )
+            # What turns away is mostly the far side of a body: all else goes before it.
+            away = surface.volume[jnp.maximum(face, 0)] >= 0
+            distance = 1 / jnp.where(depth > 0, depth, 1)
             pixel = number_of_pixel(view, pieces.pixel)
             if bodies is not None and seen is not None:
                 column, row = pieces.pixel
                 body = ranks(bodies[jnp.maximum(face, 0)], bodies.size)
                 other = jnp.any(seen[:, row, column] > body, axis=0)
-                near = [_nearer(near[0], pixel, stored((face >= 0) & other), face, depth)]
-            far = _nearer(far, pixel, face >= 0, face, -depth)
+                wanted, nearness = stored(((face >= 0) & other, jnp.where(away, -distance, depth)))
+                near = [_nearer(near[0], pixel, wanted, face, nearness)]
+            far = _nearer(far, pixel, face >= 0, face, stored(jnp.where(away, -depth, distance)))
             return n, waiting._replace(total=waiting.total & 0), last, (runs, far, *near)
 
         def is_left(state: tuple[Array, Waiting, Array, Found]) -> Array:
@@ -136,8 +140,8 @@ def survey(view: View, method: Method) -> Survey:
     few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
     unseen = [face.reshape(size) for _, face in found]
     if bodies is not None:
-        next_to = nearest_round(found[1][0].reshape(size), unseen[1])
-        unseen[1] = jnp.where(unseen[1] >= 0, unseen[1], next_to)
+        nearness = found[1][0].reshape(size)
+        unseen[1] = jnp.where(nearness > 0, unseen[1], nearest_round(nearness, unseen[1]))
     return Survey(runs, Unseen(*(stored(face.astype(few)) for face in unseen)))
 
 

@@ -25,7 +25,7 @@ from diffrast.edges.creases import buried
 from diffrast.edges.neighborhood import (
     Surface,
     first_row,
-    is_near_background,
+    of_block,
     only,
     picked,
     pixel_at,
@@ -100,6 +100,7 @@ def look(
     surface: Surface,
     face_image: Int[Array, "height_with_border width_with_border"],
     near_bare: Bool[Array, "rows columns"],
+    seen_farthest: Int[Array, "rows columns"],
     unseen: Unseen,
     cast: Cast | None,
 ) -> tuple[Seen, Pieces]:
@@ -302,10 +303,17 @@ def look(
         front_look=front_look,
         beyond_look=beyond_look,
     )
-    # The farthest unseen one, or that of the next pixel if it is of the same surface.
+    # The farthest unseen one, or that of the next pixel, or the farthest of those seen not far
+    # away: of other surfaces than the two that are walked over anyway, and not what turns away.
     next_farthest = _at(unseen.farthest, *(pieces.pixel + steps_to(beyond_look)))
-    is_other = (farthest >= 0) & (patch[_FARTHEST] != front_patch)
-    farthest = jnp.where(is_other | (next_farthest < 0), farthest, next_farthest)
+    unlike = (farthest >= 0) & (patch[_FARTHEST] != front_patch)
+    usual = jnp.where(unlike | (next_farthest < 0), farthest, next_farthest)
+    starts = jnp.stack([farthest, next_farthest, of_block(seen_farthest, *pieces.pixel)])
+    known = jnp.maximum(starts, 0)
+    walked_over = jnp.stack([front_patch, picked(patch[:9], beyond_look)])
+    is_other = jnp.all(topology.patches[known] != walked_over[:, None], axis=0)
+    best = first_row((starts >= 0) & (volume[known] < 0) & is_other)
+    farthest = jnp.where(best < 3, picked(starts, jnp.minimum(best, 2)), usual)
     rim_depth, inner = next_inwards(middle, -out)
     walks = walked(
         spot,
@@ -317,7 +325,7 @@ def look(
     )
     visible = visible & ~walks.hidden
     # Where nothing is found, and there are empty pixels not far away, the background is bare.
-    gap = walks.ends & is_near_background(near_bare, *pieces.pixel)
+    gap = walks.ends & of_block(near_bare, *pieces.pixel)
     beyond = jnp.where(walks.behind >= 0, walks.behind, beyond)
     beyond = stored(jnp.where(gap, BACKGROUND, beyond))
     beside, both_end = sides_of(front, beyond, near, walks, surface)
