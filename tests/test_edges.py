@@ -240,6 +240,48 @@ def test_tiles_seen_from_aside_are_as_exact_as_many_samples():
     np.testing.assert_allclose(got, want, atol=0.02)
 
 
+def test_strips_between_bodies_that_no_centre_shows():
+    """Two boxes of unequal heights over a floor, seen from above, and the gap between them.
+
+    It is narrower than a pixel and passes no centre. In closed form, with derivatives by the place
+    of each box; black floor, one box of red and one of green.
+    """
+    size = 12
+    view = dr.Camera.orthographic(eye=(0, 0, 9), target=(0, 0, 0), height=size, near=1, far=19)
+    settings = dr.RenderSettings(height=size, width=size)
+    colors = [dr.Material(ambient=color) for color in ((1, 0, 0), (0, 1, 0), (0, 0, 0))]
+
+    @jax.jit
+    def row(ends, heights):
+        """The left box ends at the first, the right one begins at the other."""
+        boxes = [
+            dr.linalg.compose(
+                dr.linalg.translation(jnp.stack([end + side, 0.0, height / 2])),
+                dr.linalg.scaling(jnp.stack([4.0, 4.0, height / 2])),
+            )
+            for end, side, height in zip(ends, (-4.0, 4.0), heights, strict=True)
+        ]
+        meshes = (dr.shapes.cube(), dr.shapes.cube(), dr.shapes.plane(30, 30))
+        objects = [
+            dr.Object(*thing) for thing in zip(meshes, colors, (*boxes, np.eye(4)), strict=True)
+        ]
+        scene = dr.Scene(objects=objects, lights=[dr.AmbientLight((1.0, 1.0, 1.0))])
+        return dr.render(scene, view, settings)[6, :, :2]
+
+    borders = np.arange(size) - size / 2
+    both = jax.jit(lambda *given: (row(*given), jax.jacfwd(row)(*given)))
+    places = ((0.1, 0.45), (0.47, 0.49), (0.51, 0.56), (0.6, 0.98), (0.3, 0.4), (0.6, 1.4))
+    for ends, heights in itertools.product(places, ((1.0, 2.0), (2.0, 0.5))):
+        got, change = both(jnp.array(ends), jnp.array(heights))
+        red, green = (np.clip(end - borders, 0, 1) for end in ends)
+        inside = [(end > borders) & (end < borders + 1) for end in ends]
+        want = np.stack([red, 1 - green], axis=1)
+        np.testing.assert_allclose(got, want, atol=1e-4)
+        rates = np.zeros((size, 2, 2))
+        rates[:, 0, 0], rates[:, 1, 1] = inside[0], -1.0 * inside[1]
+        np.testing.assert_allclose(change, rates, atol=1e-4)
+
+
 def test_boxes_seen_from_straight_above_have_exact_edges():
     """Black walls, seen edge-on, of white boxes on a floor whose diagonals pass by their corners.
 

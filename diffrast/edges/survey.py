@@ -110,7 +110,7 @@ def survey(view: View, method: Method) -> Survey:
             face, depth = stored_together(
                 unpictured(pieces, segments, surface.volume, view.face_image)
             )
-            # What turns away is mostly the far side of a body: all else goes before it.
+            # What turns away is mostly the far side of a body: all else goes before, above 0.
             away = surface.volume[jnp.maximum(face, 0)] >= 0
             distance = 1 / jnp.where(depth > 0, depth, 1)
             pixel = number_of_pixel(view, pieces.pixel)

@@ -14,7 +14,10 @@ from diffrast.edges.planes import FINE_TOLERANCE, beside_edge, corners_of, cover
 
 
 class Unseen(NamedTuple):
-    """Faces that have an edge in a pixel, but are seen at no centre of the 3×3 round it; or -1."""
+    """Faces that have an edge in a pixel, but are seen at no centre of the 3×3 round it; or -1.
+
+    Of such as turn away from the eye only where there are no others.
+    """
 
     farthest: Int[Array, "height width"]
     # Of other bodies than those seen there; or the nearest of those found next to the pixel.

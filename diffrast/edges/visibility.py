@@ -8,7 +8,7 @@ its own. Faces may be too thin for any pixel to show them: a walk over the surfa
 nearby, and would hide the part if it reached it, tells whether it does. Where no candidate lies
 behind the part, walks over two surfaces at the pixels around, the one beyond first, tell which of
 their faces does, or that both end before. Where only one is seen, the second may be one that no
-centre shows.
+centre shows, or the farthest that is seen a few pixels away.
 """
 
 from typing import NamedTuple
