@@ -26,6 +26,11 @@ _ROW = 64
 _TRIANGLE = np.triu(np.ones((_ROW, _ROW), np.float32))
 
 
+def integers(count: int) -> type:
+    """What -1 and the numbers below a count fit in: images of them are held for long."""
+    return jnp.int16 if count <= jnp.iinfo(jnp.int16).max else jnp.int32
+
+
 def prefix_sum(counts: Int[Array, " n"]) -> Int[Array, " n"]:
     """Running totals, each with its own entry; counts are not negative, sums of 64 below 2^24.
 

@@ -10,7 +10,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from diffrast._device import anywhere, at_once, in_strides, views_fill_lanes
-from diffrast._selection import compacted, divided, over_batches
+from diffrast._selection import compacted, divided, integers, over_batches
 from diffrast._stored import stored, stored_together
 from diffrast._topology import Topology, by_three
 from diffrast.edges.planes import Table, corners_of, covers, edge_values
@@ -119,7 +119,8 @@ def farthest_round(
     face = stored(face[middle::_BLOCK, middle::_BLOCK])
     y, x = (_BLOCK * jnp.indices(face.shape) + middle).astype(surface.pixels.dtype) - 0.5
     depth = edge_values(corners_of(face, surface.faces, surface.pixels), x, y)[1]
-    return nearest_round(stored(jnp.where(face >= 0, -depth, -jnp.inf)), face)
+    face = nearest_round(stored(jnp.where(face >= 0, -depth, -jnp.inf)), face)
+    return stored(face.astype(integers(len(surface.faces))))
 
 
 def of_block(values: Array, column: Int[Array, " n"], row: Int[Array, " n"]) -> Array:

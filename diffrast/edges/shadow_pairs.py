@@ -17,6 +17,7 @@ from diffrast.edges.pieces import Depth
 # Which of two pixels show what a shadow falls on; if one does, what the other one shows is nearer,
 # and hides where the shadow begins or ends.
 ON_BOTH, ON_FIRST, ON_SECOND = np.arange(3, dtype=np.int32)
+CODES = 9  # `coded`, of a face
 
 NEAREST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8], np.int32)  # of the 3×3 pixels,
 _PLACE = np.argsort(NEAREST)  # of pixels among these,
@@ -66,7 +67,7 @@ def coded(edge: Int[Array, "*n"], ground: Int[Array, "*n"]) -> Int[Array, "*n"]:
 
 def decoded(code: Int[Array, "*n"]) -> tuple[Int[Array, "*n"], Int[Array, "*n"]]:
     """Edges and pixels of such numbers."""
-    edge, ground = divided(jnp.maximum(code, 0), 3)
+    edge, ground = divided(jnp.maximum(code, 0).astype(jnp.int32), 3)
     return jnp.where(code < 0, -1, edge), ground
 
 

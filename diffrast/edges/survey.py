@@ -7,7 +7,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from diffrast._device import anywhere
-from diffrast._selection import batches_of, over_batches, prefix_sum
+from diffrast._selection import batches_of, integers, over_batches, prefix_sum
 from diffrast._stored import stored, stored_together
 from diffrast.edges.blend import Method, View, number_of_pixel
 from diffrast.edges.neighborhood import Surface, nearest_round
@@ -136,13 +136,12 @@ def survey(view: View, method: Method) -> Survey:
     no_runs = jnp.zeros(view.apart.size, jnp.uint32) + (edges.count & 0).astype(jnp.uint32)
     start: Found = (no_runs, *[none] * (1 if bodies is None else 2))
     runs, *found = over_batches(edges.order, edges.count, edges.at_once.edges, add_edges, start)
-    # Held by all that follows: numbers of few faces take two bytes.
-    few = jnp.int16 if view.faces.shape[0] <= jnp.iinfo(jnp.int16).max else jnp.int32
     unseen = [face.reshape(size) for _, face in found]
     if bodies is not None:
         nearness = found[1][0].reshape(size)
         unseen[1] = jnp.where(nearness > 0, unseen[1], nearest_round(nearness, unseen[1]))
-    return Survey(runs, Unseen(*(stored(face.astype(few)) for face in unseen)))
+    held = integers(len(view.faces))
+    return Survey(runs, Unseen(*(stored(face.astype(held)) for face in unseen)))
 
 
 def _nearer(best: Nearest, pixel: Array, wanted: Array, face: Array, depth: Array) -> Nearest:

@@ -23,14 +23,22 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int, Shaped
 
 from diffrast._device import anywhere, lanes, over_views
-from diffrast._selection import divided, over_batches, selected
+from diffrast._selection import divided, integers, over_batches, selected
 from diffrast._stored import stored, zero_after
 from diffrast._topology import Topology
 from diffrast.edges.follow import covering, follow, leaves
 from diffrast.edges.neighborhood import Surface, first_row, picked, walk
 from diffrast.edges.pieces import depth_of, facing, scale_by_depth, to_pixels
 from diffrast.edges.planes import Table, barycentrics, corners_of, edge_functions, edge_values
-from diffrast.edges.shadow_pairs import ON_BOTH, ON_FIRST, ON_SECOND, coded, decoded, on_ground
+from diffrast.edges.shadow_pairs import (
+    CODES,
+    ON_BOTH,
+    ON_FIRST,
+    ON_SECOND,
+    coded,
+    decoded,
+    on_ground,
+)
 from diffrast.geometry import Geometry, Points, positions_at
 from diffrast.light import Light, casts_shadow
 from diffrast.raster.evaluate import unit_of
@@ -173,9 +181,10 @@ def _between_pixels(
             lamps, lamp, exists, guessed, pictures, geometry, topology, *stored((dark, lit_end))
         )
         place = jnp.where(exists, number, codes.size)
-        return codes.at[place].set(coded(edge, ground), mode="drop")
+        return codes.at[place].set(coded(edge, ground).astype(codes.dtype), mode="drop")
 
-    none = jnp.full(differs.size, -1, jnp.int32) + zero_after(count)
+    held = integers(CODES * len(geometry.faces))
+    none = jnp.full(differs.size, -1, held) + zero_after(count).astype(held)
     return over_batches(order, count, lanes() * _AT_ONCE, look, none).reshape(differs.shape)
 
 
