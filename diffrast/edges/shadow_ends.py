@@ -14,13 +14,13 @@ from diffrast.edges.planes import ASIDE, TOLERANCE, dot_rows, edge_values, large
 from diffrast.edges.shadow_planes import Plane
 
 ROUNDED = 0.02  # pixels: more than lines, and what is lit, move by rounding
+ONE_LINE = 1e-3  # pixels: how far lines that are one may be apart
 REACH = 0.75  # pixels from the centre: farther than the corners
 _TOUCHES = 1e-4  # of its size: how far from the plane of a face an edge may end that stands on it
 _STEEP = 1e-3  # of its size: how far an edge at least goes into the plane of a face
 _BLUNT = 0.05  # cosine: of sharper corners the sides are moved less far than that takes
 _FLAT = 0.1  # pixels: how far lines on faces that count as one plane may be apart
 _GAP = 1e-3  # of a line: how far faces that cover it may be apart
-_ONE_LINE = 1e-3  # pixels: how far lines on two faces that are one may be apart
 
 
 def enter(
@@ -70,7 +70,7 @@ def continued(
         (other > one) | ((other == one) & (jnp.arange(faces)[:, None] > order))
     )
     aside = _cross(axis, foot) / REACH
-    beside = jnp.abs(aside[:, :, None] - aside[:, None]) < _ONE_LINE
+    beside = jnp.abs(aside[:, :, None] - aside[:, None]) < ONE_LINE
     again = jnp.any(
         here[:, :, None] & later & beside & (2 * begin[:, None] < middle[:, :, None]), axis=1
     )

@@ -36,6 +36,7 @@ from diffrast.edges.planes import (
     room_in_pixel,
 )
 from diffrast.edges.shadow_ends import (
+    ONE_LINE,
     REACH,
     ROUNDED,
     common,
@@ -358,12 +359,20 @@ def shadow_of(
     edge = of_edge(outlines.edge)
     at, hides = _before(pixel, edge, covering, face, cast, surface, face_image)
     first, last = (stored(jnp.stack([*point, _nearness(ground, *point)])) for point in whole)
-    bare = uncovered(first, last, at, hides)
+    # What hides its dark side, or its lit one, may end in one line with it: what is beyond that
+    # then is so anyway, but where the line passes a centre that shows the ground in its other way.
+    lit_on_right = one(outlines.lit_on_right)
+    other_side = ONE_LINE * jnp.where(lit_on_right == centre_is_lit, -normal, normal)
+    told = outlines.on_centre[place] & (jnp.hypot(*foot) < ROUNDED)
+    sides = [
+        jnp.stack([*side, jnp.zeros_like(foot[0])])
+        for side in (other_side, jnp.where(told, other_side, -other_side))
+    ]
+    bare = common(*(uncovered(first + side, last + side, at, hides) for side in sides))
     bare = common(bare, _out_of(covering[::2], (first, last), pixel, surface))
     low, high = stored_together([low + part * (high - low) for part in bare])
     exists = exists & (low < high)
     x, y = middle = foot + (low + high) / 2 * along
-    lit_on_right = one(outlines.lit_on_right)
     centre_on_right = dot_rows(foot, normal) < 0
     # What a line bounds may be dark or lit for another reason.
     wrong_side = alone & ((lit_on_right == centre_on_right) != centre_is_lit)
