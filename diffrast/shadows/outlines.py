@@ -309,7 +309,7 @@ def _edge_between(
         nearest = first_row(nearby.key == jnp.max(nearby.key, axis=0))
         row = jnp.where(farthest >= 0, first_row(part == farthest), jnp.minimum(nearest, 8))
         hidden = rays.asked & ((farthest >= 0) | ((looks == 0) & ~unsure))
-        # At a guessed end, where the way ends, too, only whether anything hides the light counts.
+        # At a guessed end the light may be hidden all the way.
         at_end = rays.asked & guessed[1] & (looks > 0) & jnp.any(nearby.cut.stops > 0, axis=0)
         face = jnp.where(hidden, picked(nearby.face, row), -1)
         face = covering(face, farthest < 0, topology.neighbors, corners_of, way[0])
@@ -321,13 +321,10 @@ def _edge_between(
         goes_on = following >= 0
         ground = covering(rays.face, goes_on, topology.neighbors, corners_of, [x, y])
         shares = jnp.stack(barycentrics(edge_functions(corners_of(ground), x, y)[0]))
-        goes_on = goes_on & (guessed[1] | (jnp.min(shares, axis=0) >= 0))
-        shares = jnp.where(guessed[1], jnp.stack(bright.barycentrics), shares)
-        x, y = (jnp.where(guessed[1], a, b) for a, b in zip(ends[1], (x, y), strict=True))
-        ground = jnp.where(guessed[1], bright.face, ground)
-        rays = rays._replace(face=ground, barycentrics=shares, x=x, y=y, asked=goes_on)
+        is_there = jnp.min(shares, axis=0) >= 0
+        rays = rays._replace(face=ground, barycentrics=shares, x=x, y=y, asked=goes_on & is_there)
         edge = jnp.where(unsure & (hidden | at_end), -1, edge)
-        edge = jnp.where(following >= 0, following, edge)
+        edge = jnp.where(goes_on & (is_there | ~guessed[1]), following, edge)
         return stored((looks + 1, rays, edge))
 
     def is_left(state: _Look) -> Array:
