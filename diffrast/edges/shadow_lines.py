@@ -206,7 +206,6 @@ def cross_shadows(
     from_edges = [
         dot_rows(shadow.normal[:, :, None], end[:, None]) + shadow.offset[:, None] for end in ends
     ]
-    on_dark_side = stored((from_edges[0] + from_edges[1]) * above[:, None] > 0)
     ends_of = [end_plane(source[:, None], weight, shadow, *way) for way in (ends, ends[::-1])]
     behind = behind_edge(source[:, None], weight, shadow, *ends)
     ground = Plane(ground.normal[:, None], ground.offset[None])
@@ -221,6 +220,8 @@ def cross_shadows(
     to_lit = (steps_to(lit_look) - steps_to(dark_look))[:, :, None]
     lit_on_right = jnp.where(tells[:, None], above[:, None] <= 0, dot_rows(normal, to_lit) > 0)
     outwards = jnp.where(lit_on_right, 1, -1) * normal
+    dark_sign = jnp.where(lit_on_right[:, :1], -1, 1)
+    on_dark_side = stored((from_edges[0] + from_edges[1]) * dark_sign > 0)
     beyond = dot_rows(outwards, foot)  # less than this along `outwards` it is dark
     # Of an edge that hides something else the line passes elsewhere.
     outer, inner = (dot_rows(outwards, steps_to(look)[:, :, None]) - beyond for look in looks)
