@@ -80,7 +80,8 @@ def overlap(
     decided, either = if_both != if_either, if_either < if_both
     chosen = valid & (chosen | decided)
     # One that goes on beyond where its edge ends may leave the centre dark that is lit.
-    leaves_lit = (beyond < ROUNDED) | jnp.any(told[4] & corner, axis=1)
+    lets_pass = beyond < ROUNDED
+    leaves_lit = lets_pass | jnp.any(lets_pass & corner, axis=1)
     leaves_lit = jnp.all(leaves_lit | ~together, axis=1)
     chosen = chosen & (leaves_lit | ~(lit[4] & counts[4]))
     return Overlap(
