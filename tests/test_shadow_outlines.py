@@ -120,6 +120,108 @@ def test_outlines_through_the_centres_of_pixels():
         np.testing.assert_allclose(got[10:12], want, atol=1e-4)
 
 
+BLACK = dr.Material(ambient=(0, 0, 0), diffuse=(0, 0, 0))
+
+
+def from_straight_above(size, far=20.0):
+    """One unit is a pixel; x to the right, z downwards, and the middle at the origin."""
+    return dr.Camera.orthographic(
+        eye=(0, far / 2, 0), up=(0, 0, -1), target=(0, 0, 0), height=size, near=0.1, far=far
+    )
+
+
+def block(lower, upper, material=None):
+    """A box from one corner to another."""
+    lower, upper = jnp.stack(lower), jnp.stack(upper)
+    place = linalg.translation((lower + upper) / 2) @ linalg.scaling((upper - lower) / 2)
+    return dr.Object(shapes.cube(), material, place)
+
+
+@pytest.mark.parametrize("along", [(0.5, -1.0, 0.0), (-0.25, -1.0, 0.0)])
+def test_walls_in_whose_plane_light_and_sight_are(along):
+    """The outline of a wall's shadow is in one line with the wall's edge, which hides one side.
+
+    Area and derivative in closed form, by where the wall is: beside the box, and beyond it.
+    """
+    size = 12
+
+    @jax.jit
+    def column(part):
+        box = block((-3.0, 0.0, -4.0), (2.0, 3.0, part), BLACK)
+        scene = dr.Scene(objects=[box, floor(shapes.plane(60, 60), 0.0)], lights=[sun(along)])
+        options = dr.RenderSettings(height=size, width=size)
+        return dr.render(scene, from_straight_above(size), options)[..., 0]
+
+    beyond = 8 if along[0] > 0 else 2  # a column in which all of it is dark
+    for part in (0.02, 0.2, 0.45, 0.49, 0.499, 0.51, 0.52, 0.8, 0.98):
+        got, change = jax.jvp(column, (part,), (1.0,))
+        lit, dark = got[-1, -1], got[3, beyond]
+        assert dark < 0.5 * lit
+        np.testing.assert_allclose(got[6, 4:7], (1 - part) * lit, atol=1e-4)
+        np.testing.assert_allclose(change[6, 4:7], -lit, atol=1e-3)
+        np.testing.assert_allclose(got[6, beyond], part * dark + (1 - part) * lit, atol=1e-4)
+        np.testing.assert_allclose(change[6, beyond], dark - lit, atol=1e-3)
+
+
+def test_a_lit_strip_between_a_sheet_and_a_shadow():
+    """It is narrower than a pixel, and no centre shows it; area and derivative in closed form."""
+    size, high, slope = 12, 8.0, 0.5
+    flat = linalg.rotation_x(-np.pi / 2)
+
+    @jax.jit
+    def row(covered, shaded):
+        place = jnp.stack([covered - 4.0, 1.0, 0.0])  # its own shadow lies under it
+        sheet = dr.Object(shapes.plane(8.0, 40.0), BLACK, linalg.translation(place) @ flat)
+        # A roof behind the camera.
+        place = jnp.stack([shaded + slope * high + 15.0, high, 0.0])
+        roof = dr.Object(shapes.plane(30.0, 40.0), BLACK, linalg.translation(place) @ flat)
+        ground = floor(shapes.plane(60, 60), 0.0)
+        scene = dr.Scene(objects=[sheet, roof, ground], lights=[sun((-slope, -1.0, 0.0))])
+        options = dr.RenderSettings(height=size, width=size)
+        view = from_straight_above(size, far=10.0)
+        return dr.render(scene, view, options)[size // 2, :, 0]
+
+    lit = row(-4.0, 5.0)[6]
+    for covered, shaded in itertools.product((0.55, 0.7, 0.95), (1.05, 1.2, 1.45)):
+        got, change = jax.jvp(row, (covered, shaded), (1.0, 0.5))
+        dark = got[9]
+        assert dark < 0.5 * lit
+        np.testing.assert_allclose(got[6], (1 - covered) * lit, atol=1e-4)
+        np.testing.assert_allclose(got[7], (shaded - 1) * lit + (2 - shaded) * dark, atol=1e-4)
+        np.testing.assert_allclose(change[6], -lit, atol=1e-3)
+        np.testing.assert_allclose(change[7], 0.5 * (lit - dark), atol=1e-3)
+
+
+def test_shadows_of_boxes_seen_from_above_are_as_of_many_samples():
+    """Two boxes each, and a light: corners at round places, or walls in the plane of the light."""
+    size = 32
+    places = np.array(
+        [
+            [[(-4.75, 0, -5.625), (3, 1, -0.875)], [(3, 0, 1.75), (10.875, 3, 8.375)]],
+            [[(-2, 4, -1), (4, 7, 7)], [(0, 4, 2), (5.5, 8, 9.5)]],
+            [[(-9.5, 0, 3), (-3.75, 4, 9)], [(-3.375, 4, -10), (5.625, 5, -3.75)]],
+            [[(-3.13, 0, -2.259), (0.758, 2, 2.862)], [(0.775, 2, 0.6), (9.278, 8, 6.477)]],
+            [[(-7.125, 2, 3.12), (0.51, 8, 10.502)], [(-0.354, 0, -3.118), (6.893, 4, 3.515)]],
+            [[(-7.494, 4, -4.249), (-2.529, 10, 1.227)], [(-4.511, 2, 2.763), (2.735, 8, 8.249)]],
+        ]
+    )
+    slopes = [(-0.5, 0.0), (0.25, 0.5), (-0.5, 0.25), (0.25, 0.0), (0.0, -0.25), (0.0, -0.5)]
+
+    @partial(jax.jit, static_argnames="samples")
+    def picture(boxes, slope, samples=1):
+        objects = [*(block(*box) for box in boxes), floor(shapes.plane(90, 90), 0.0)]
+        lights = [sun(jnp.stack([slope[0], -1.0, slope[1]]))]
+        options = dr.RenderSettings(
+            height=size, width=size, antialias=samples == 1, samples=samples
+        )
+        scene = dr.Scene(objects=objects, lights=lights)
+        return dr.render(scene, from_straight_above(size, far=40.0), options)
+
+    for boxes, slope in zip(places, slopes, strict=True):
+        at = jnp.array(boxes), jnp.array(slope)
+        np.testing.assert_allclose(picture(*at), picture(*at, samples=1024), atol=0.03)
+
+
 def test_an_outline_that_goes_on_behind_a_sheet():
     """Seen from above; the centre of the pixel where they cross shows the sheet or the floor.
 
