@@ -360,8 +360,8 @@ def shadow_of(
     edge = of_edge(outlines.edge)
     at, hides = _before(pixel, edge, covering, face, cast, surface, face_image)
     first, last = (stored(jnp.stack([*point, _nearness(ground, *point)])) for point in whole)
-    # What hides its dark side, or its lit one, may end in one line with it: what is beyond that
-    # then is so anyway, but where the line passes a centre that shows the ground in its other way.
+    # What hides one of its sides, and ends in one line with it, leaves nothing of it to be seen;
+    # unless it passes a centre that shows the ground, and is told to be on the hidden side.
     lit_on_right = one(outlines.lit_on_right)
     other_side = ONE_LINE * jnp.where(lit_on_right == centre_is_lit, -normal, normal)
     told = outlines.on_centre[place] & (jnp.hypot(*foot) < ROUNDED)

@@ -9,7 +9,7 @@ whatever the size of faces and texels. Indices only: no derivatives.
 
 Where one of them shows something nearer, the other's surface may be lit at one and dark at the
 other, too: a shadow begins under the outline of what casts it. There the point of the surface's
-plane behind the nearer thing is the lit or the dark one.
+plane behind the nearer thing is the lit or the dark one; before the former light has to come in.
 """
 
 from collections.abc import Callable
@@ -279,8 +279,8 @@ def _edge_between(
 ) -> Int[Array, " n"]:
     """The edge whose shadow passes between points in the dark and others in the light.
 
-    Of some it is `guessed` that they are in the dark (0), or in the light (1); there is none if
-    they are not.
+    Of some it is `guessed` that they are in the dark (0): there is none if they are not. Or in the
+    light (1): none if no light comes in on the way there.
     """
     at_dark, at_bright = (
         stored(jnp.stack(positions_at(geometry, points))) for points in (dark, bright)
