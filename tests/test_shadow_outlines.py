@@ -192,6 +192,35 @@ def test_a_lit_strip_between_a_sheet_and_a_shadow():
         np.testing.assert_allclose(change[7], 0.5 * (lit - dark), atol=1e-3)
 
 
+def test_a_strip_between_a_shadow_and_the_end_of_a_sheet():
+    """Lit or dark, on the nearer surface; no centre shows it. Closed form, with derivatives."""
+    size, high, slope = 12, 8.0, 0.5
+    flat = linalg.rotation_x(-np.pi / 2)
+
+    @jax.jit
+    def row(begin, covered, side):
+        place = jnp.stack([covered - 4.0, 1.0, 0.0])
+        sheet = dr.Object(shapes.plane(10.0, 40.0), None, linalg.translation(place) @ flat)
+        # A roof behind the camera: its shadow ends or begins where the strip does.
+        place = jnp.stack([begin + slope * (high - 1.0) + 15.0 * side, high, 0.0])
+        roof = dr.Object(shapes.plane(30.0, 40.0), BLACK, linalg.translation(place) @ flat)
+        ground = dr.Object(shapes.plane(60.0, 60.0), BLACK, flat)
+        scene = dr.Scene(objects=[sheet, roof, ground], lights=[sun((-slope, -1.0, 0.0))])
+        options = dr.RenderSettings(height=size, width=size)
+        return dr.render(scene, from_straight_above(size, far=10.0), options)[size // 2, :, 0]
+
+    for side, begin, covered in itertools.product(
+        (-1.0, 1.0), (0.55, 0.7, 0.95), (0.05, 0.2, 0.45)
+    ):
+        got, change = jax.jvp(partial(row, side=side), (begin, covered), (1.0, 0.5))
+        centre, strip = got[3], row(-8.0, covered, side)[3]
+        assert (strip - centre) * side < -0.3
+        np.testing.assert_allclose(got[6], begin * centre + (1 - begin) * strip, atol=1e-4)
+        np.testing.assert_allclose(got[7], covered * strip, atol=1e-4)
+        np.testing.assert_allclose(change[6], centre - strip, atol=1e-3)
+        np.testing.assert_allclose(change[7], 0.5 * strip, atol=1e-3)
+
+
 def test_shadows_of_boxes_seen_from_above_are_as_of_many_samples():
     """Two boxes each, and a light: corners at round places, or walls in the plane of the light."""
     size = 32
@@ -232,14 +261,13 @@ def test_an_outline_that_goes_on_behind_a_sheet():
     camera = dr.Camera.orthographic(
         eye=(0, 5, 0), up=(0, 0, -1), target=(0, 0, 0), height=size * pixel, near=0.1, far=20.0
     )
-    black = dr.Material(ambient=(0, 0, 0), diffuse=(0, 0, 0))
     light = sun((-slope, -1.0, slope))
 
     @jax.jit
     def picture(covered, lit):
         edge = (2 + covered) * pixel  # of the sheet, in column 10; its shadow lies under it
         place = jnp.stack([edge - 2.0, 1.0, 0.0])
-        sheet = dr.Object(shapes.plane(4.0, 12.0), black, linalg.translation(place) @ down)
+        sheet = dr.Object(shapes.plane(4.0, 12.0), BLACK, linalg.translation(place) @ down)
         front = lit * pixel - slope * high  # its shadow begins in row 8
         place = jnp.stack([slope * high, high, front + 6.0])
         roof = dr.Object(shapes.plane(24.0, 12.0), None, linalg.translation(place) @ down)

@@ -99,7 +99,7 @@ class Outlines(NamedTuple):
     weight: Float[Array, " n"]  # and its h
     lit_on_right: Bool[Array, "edges faces n"]
     looks: Int[Array, "2 edges n"]  # 0 to 8: of two pixels that they part the lit and the dark one
-    hider: Int[Array, "edges n"]  # what hides where the shadow begins or ends; -1: nothing
+    hider: Int[Array, "edges n"]  # what may hide where the shadow begins or ends; -1: nothing
     centre_is_lit: Bool[Array, " n"]  # in the image
     on_centre: Bool[Array, " n"]  # whether that shows what the shadows fall on
     alone: Bool[Array, " n"]  # whether there is one line only, and the centre turns to the light

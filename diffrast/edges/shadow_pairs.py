@@ -14,8 +14,8 @@ from diffrast._stored import stored
 from diffrast.edges.neighborhood import steps_to
 from diffrast.edges.pieces import Depth
 
-# Which of two pixels show what a shadow falls on; if one does, what the other one shows is nearer,
-# and hides where the shadow begins or ends.
+# Which of two pixels show what a shadow falls on; if one does, that surface goes on behind what the
+# other one shows, or ends before that.
 ON_BOTH, ON_FIRST, ON_SECOND = np.arange(3, dtype=np.int32)
 CODES = 9  # `coded`, of a face
 

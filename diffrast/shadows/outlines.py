@@ -7,9 +7,11 @@ away from the light. Where something else hides the light just beyond, that is f
 nothing does. The last edge has the outline of the shadow that passes between the two pixels,
 whatever the size of faces and texels. Indices only: no derivatives.
 
-Where one of them shows something nearer, the other's surface may be lit at one and dark at the
-other, too: a shadow begins under the outline of what casts it. There the point of the surface's
-plane behind the nearer thing is the lit or the dark one; before the former light has to come in.
+Where they show two surfaces, each of these may be lit at one and dark at the other, too: a shadow
+begins under the outline of what casts it, on the farther one, or ends shortly before the nearer one
+does. There the point of the surface's plane at the other pixel, behind what that shows or beyond
+the surface's end, is the lit or the dark one; before the former light has to come in. One edge is
+kept of two pixels, that on the nearer surface before that on the farther one.
 """
 
 from collections.abc import Callable
@@ -138,10 +140,11 @@ def _between_pixels(
         lamp, is_below = divided(pair, 2)
         return stored((lamp, jnp.stack([at, at + jnp.where(is_below == 0, 1, width)])))
 
-    def ground_of(number: Array) -> tuple[Array, Array]:
-        """On the surface of which of them a shadow may begin or end between them, -1 on none.
+    def grounds_of(number: Array) -> tuple[Array, Array]:
+        """On the surfaces of which of them shadows may begin or end between them, -1 on none.
 
-        Also the barycentric coordinates of where the plane of what each shows is at the other one.
+        First on the nearer one, then on the farther one, or the one that both show. Also the
+        barycentric coordinates of where the plane of what each shows is at the other one.
         """
         lamp, at = of_pair(number)
         shown = stored(face[at])
@@ -152,36 +155,47 @@ def _between_pixels(
         row, column = (place.astype(pixels.dtype) + 0.5 for place in divided(at, width))
         _, nearness = edge_values(corners, column, row)
         values, there = edge_values(corners, column[::-1], row[::-1])
-        hidden = turned & (there > 0) & (there < nearness[::-1])
-        on_one = jnp.where(hidden[0], ON_FIRST, jnp.where(hidden[1], ON_SECOND, -1))
-        ground = jnp.where(patch[0] == patch[1], jnp.where(parts, ON_BOTH, -1), on_one)
-        ground = jnp.where(jnp.min(shown, axis=0) < 0, -1, ground)
+        apart = patch[0] != patch[1]
+        possible, hidden = apart & turned & (there > 0), there < nearness[::-1]
+        nearer, farther = (
+            jnp.where(first, ON_FIRST, jnp.where(second, ON_SECOND, -1))
+            for first, second in (possible & ~hidden, possible & hidden)
+        )
+        grounds = jnp.stack([nearer, jnp.where(~apart & parts, ON_BOTH, farther)])
+        grounds = jnp.where(jnp.min(shown, axis=0) < 0, -1, grounds)
         scales = stored(scale[stored(geometry.faces.T[:, jnp.maximum(shown, 0)])])
-        return stored((ground, jnp.stack(barycentrics([*(scales * jnp.stack(values))]))))
+        return stored((grounds, jnp.stack(barycentrics([*(scales * jnp.stack(values))]))))
 
     patch = topology.patches[points.face]
     differs = _side_by_side(lit, jnp.not_equal) | _side_by_side(patch, jnp.not_equal)
-    order, count = selected(differs, lambda number: ground_of(number)[0] >= 0)
+    order, count = selected(differs, lambda number: jnp.max(grounds_of(number)[0], axis=0) >= 0)
 
     def look(number: Array, exists: Array, codes: Array) -> Array:
-        (ground, extended), (lamp, at) = ground_of(number), of_pair(number)
-        unsure = ground != ON_BOTH
-        home, away = on_ground(ground, at, at[::-1])
-        own = stored(face[home])
-        there = on_ground(ground, extended[:, 0], extended[:, 1])
-        there = jnp.where(unsure, there, shares[:, away])
-        ends = [
-            Points(own, list(shares[:, home]), home),
-            Points(jnp.where(unsure, own, face[away]), list(there), away),
-        ]
-        is_lit = bright[lamp, home]
-        dark, lit_end = _where(is_lit, ends[1], ends[0]), _where(is_lit, ends[0], ends[1])
-        guessed = jnp.stack([unsure & is_lit, unsure & ~is_lit])
-        edge = _edge_between(
-            lamps, lamp, exists, guessed, pictures, geometry, topology, *stored((dark, lit_end))
-        )
+        (grounds, extended), (lamp, at) = grounds_of(number), of_pair(number)
+
+        def on(which: Array, code: Array) -> Array:
+            ground = grounds[which]
+            unsure = ground != ON_BOTH
+            home, away = on_ground(ground, at, at[::-1])
+            own = stored(face[home])
+            there = on_ground(ground, extended[:, 0], extended[:, 1])
+            there = jnp.where(unsure, there, shares[:, away])
+            ends = [
+                Points(own, list(shares[:, home]), home),
+                Points(jnp.where(unsure, own, face[away]), list(there), away),
+            ]
+            is_lit = bright[lamp, home]
+            dark, lit_end = _where(is_lit, ends[1], ends[0]), _where(is_lit, ends[0], ends[1])
+            guessed = jnp.stack([unsure & is_lit, unsure & ~is_lit])
+            asked = exists & (ground >= 0) & (code < 0)
+            edge = _edge_between(
+                lamps, lamp, asked, guessed, pictures, geometry, topology, *stored((dark, lit_end))
+            )
+            return jnp.where(asked, coded(edge, ground), code)
+
+        code = lax.fori_loop(0, len(grounds), on, jnp.full_like(number, -1))
         place = jnp.where(exists, number, codes.size)
-        return codes.at[place].set(coded(edge, ground).astype(codes.dtype), mode="drop")
+        return codes.at[place].set(code.astype(codes.dtype), mode="drop")
 
     held = integers(CODES * len(geometry.faces))
     none = jnp.full(differs.size, -1, held) + zero_after(count).astype(held)
